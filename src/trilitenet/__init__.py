@@ -1,0 +1,44 @@
+"""Light driving perception: vehicles, drivable area and lane lines from one tiny network.
+
+    import trilitenet
+
+    predictor = trilitenet.load("tiny")
+    perception = predictor("photo.jpg")
+    perception.boxes.xyxy, perception.drivable, perception.lane
+
+Public names are loaded when first used (PEP 562), so that a predictor on ONNX Runtime or OpenVINO never loads PyTorch.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from trilitenet.models.trilitenet import build_network as build_network
+    from trilitenet.models.weights import load_network as load_network
+    from trilitenet.structures import Boxes as Boxes
+    from trilitenet.structures import Perception as Perception
+
+_PUBLIC = {
+    "Boxes": "trilitenet.structures",
+    "Perception": "trilitenet.structures",
+    "build_network": "trilitenet.models.trilitenet",
+    "load_network": "trilitenet.models.weights",
+}
+
+__all__ = ["Boxes", "Perception", "__version__", "build_network", "load_network"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PUBLIC:
+        value = getattr(importlib.import_module(_PUBLIC[name]), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'trilitenet' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

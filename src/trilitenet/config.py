@@ -1,0 +1,274 @@
+"""Constants and plain configuration: variants of the network, the model card, and strict parsing.
+
+Nothing here imports NumPy or PyTorch. Configuration is parsed once, at the edge, into frozen dataclasses; an unknown
+key is an error that names the nearest known one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from typing import Any, Final, Literal, TypeVar
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from trilitenet.errors import ConfigError, WeightsError, did_you_mean
+
+__all__ = [
+    "CARD_SCHEMA",
+    "DEFAULT_ANCHORS",
+    "IMAGE_MEAN",
+    "IMAGE_STD",
+    "LONG_SIDE",
+    "MAX_STRIDE",
+    "STRIDES",
+    "TASKS",
+    "VARIANTS",
+    "Anchors",
+    "ModelCard",
+    "Task",
+    "Thresholds",
+    "VariantConfig",
+    "check_tasks",
+    "get_variant",
+    "parse",
+]
+
+Task = Literal["detection", "drivable", "lane"]
+TASKS: Final[tuple[Task, ...]] = ("detection", "drivable", "lane")
+
+IMAGE_MEAN: Final = (0.485, 0.456, 0.406)
+"""Mean of RGB / 255 that the network's input is normalised with (ImageNet's)."""
+IMAGE_STD: Final = (0.229, 0.224, 0.225)
+"""Standard deviation of RGB / 255 that the network's input is normalised with (ImageNet's)."""
+
+STRIDES: Final = (8, 16, 32)
+"""Input pixels a cell of P3, P4 and P5."""
+MAX_STRIDE: Final = 32
+"""Height and width of the network's input are multiples of this."""
+LONG_SIDE: Final = 640
+"""Pixels the longer side of an image is resized to by default (Section IV-A: 1280x720 becomes 640x384)."""
+
+Anchors = tuple[tuple[tuple[float, float], ...], ...]
+"""Anchor sizes (width, height) in input pixels: one tuple a level (1/8, 1/16, 1/32), three anchors each."""
+
+DEFAULT_ANCHORS: Final[Anchors] = (
+    ((7.0, 6.0), (13.0, 11.0), (22.0, 18.0)),
+    ((36.0, 28.0), (54.0, 45.0), (91.0, 64.0)),
+    ((121.0, 103.0), (191.0, 151.0), (320.0, 229.0)),
+)
+"""Anchors for vehicles in 640-pixel road frames, used until auto-anchor or a checkpoint brings others."""
+
+
+@dataclasses.dataclass(frozen=True)
+class VariantConfig:
+    """One column of the paper's configuration table (Section III-B).
+
+    Attributes:
+        name: ``"tiny"``, ``"small"`` or ``"base"``.
+        channels: c0 .. c4. C1 has c1 channels; C3, C4 and C5 have c4; P3, P4 and P5 have c3; F_pcaa after its 3x3
+            convolution has c2.
+        p: Depth-wise ESP blocks at 1/4.
+        q: Depth-wise ESP blocks at 1/8.
+    """
+
+    name: str
+    channels: tuple[int, int, int, int, int]
+    p: int
+    q: int
+
+
+VARIANTS: Final[dict[str, VariantConfig]] = {
+    "tiny": VariantConfig("tiny", (4, 8, 16, 32, 64), p=1, q=1),
+    "small": VariantConfig("small", (8, 16, 32, 64, 128), p=2, q=3),
+    "base": VariantConfig("base", (16, 32, 64, 128, 256), p=3, q=5),
+}
+
+
+def get_variant(name: str) -> VariantConfig:
+    """Return the variant called ``name``.
+
+    Raises:
+        ConfigError: If there is none; the message lists those that exist.
+    """
+    if name not in VARIANTS:
+        raise ConfigError(f"unknown variant {name!r}; known: {', '.join(VARIANTS)}")
+    return VARIANTS[name]
+
+
+def check_tasks(tasks: tuple[str, ...] | list[str]) -> tuple[Task, ...]:
+    """Return ``tasks`` in canonical order, each once.
+
+    Raises:
+        ConfigError: If there is none, or an unknown one.
+    """
+    for task in tasks:
+        if task not in TASKS:
+            raise ConfigError(f"unknown task {task!r}{did_you_mean(task, TASKS)}")
+    chosen = tuple(task for task in TASKS if task in tasks)
+    if not chosen:
+        raise ConfigError(f"at least one task is needed, of {', '.join(TASKS)}")
+    return chosen
+
+
+@dataclasses.dataclass(frozen=True)
+class Thresholds:
+    """What turns scores into decisions; fixed on a validation split and stored with the weights.
+
+    Attributes:
+        confidence: A box is kept when objectness x class probability is above this, in [0, 1].
+        iou: Non-maximum suppression drops a box that overlaps a better one of its class by more, in [0, 1].
+        max_boxes: At most so many boxes an image.
+        drivable: A pixel is drivable when its probability is above this, in [0, 1].
+        lane: A pixel is lane marking when its probability is above this, in [0, 1].
+    """
+
+    confidence: float = 0.25
+    iou: float = 0.6
+    max_boxes: int = 300
+    drivable: float = 0.5
+    lane: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("confidence", "iou", "drivable", "lane"):
+            value = getattr(self, name)
+            if not 0.0 <= value <= 1.0:
+                raise ConfigError(f"{name} must be between 0 and 1, got {value}")
+        if self.max_boxes < 1:
+            raise ConfigError(f"max_boxes must be at least 1, got {self.max_boxes}")
+
+
+CARD_SCHEMA: Final = 1
+"""Version of the card's layout; a file with a higher one is refused."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelCard:
+    """All that a file of weights or an exported artefact says of itself, so that it can be used with nothing else.
+
+    Attributes:
+        variant: ``"tiny"``, ``"small"`` or ``"base"``.
+        class_names: Names of the detection classes, in the order of the network's outputs.
+        tasks: The tasks the network was built with.
+        blocks: Optional parts the network has, of ``"pcaa"``, ``"litepan"``, ``"spp"`` (all, but in ablations).
+        input_size: (height, width) in pixels that training used; other multiples of 32 work too.
+        mean: Of RGB / 255, a channel.
+        std: Of RGB / 255, a channel.
+        anchors: (width, height) in input pixels, three a level.
+        thresholds: Decision thresholds fixed on a validation split.
+        training_data: What it was trained on: one line a source, with counts and licence.
+        metrics: Measured figures, by name, with the split and protocol in the name.
+        licence: Licence and allowed use of the weights (the code's is apart).
+        provenance: Recipe, commit, seed, hours, hardware, and whatever else tells where the weights come from.
+        notes: What it is bad at, and anything a user should know.
+        schema: Version of this layout.
+    """
+
+    variant: str
+    class_names: tuple[str, ...] = ("vehicle",)
+    tasks: tuple[Task, ...] = TASKS
+    blocks: tuple[str, ...] = ("pcaa", "litepan", "spp")
+    input_size: tuple[int, int] = (384, 640)
+    mean: tuple[float, float, float] = IMAGE_MEAN
+    std: tuple[float, float, float] = IMAGE_STD
+    anchors: Anchors = DEFAULT_ANCHORS
+    thresholds: Thresholds = Thresholds()
+    training_data: tuple[str, ...] = ()
+    metrics: dict[str, float] = dataclasses.field(default_factory=dict)
+    licence: str = "not stated"
+    provenance: dict[str, str] = dataclasses.field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    schema: int = CARD_SCHEMA
+
+    @property
+    def classes(self) -> int:
+        """Number of detection classes."""
+        return len(self.class_names)
+
+    def to_json(self) -> str:
+        """Return the card as one line of JSON."""
+        return json.dumps(dataclasses.asdict(self), ensure_ascii=False)
+
+    @classmethod
+    def from_json(cls, text: str, source: str) -> ModelCard:
+        """Read a card.
+
+        Args:
+            text: What `to_json` wrote.
+            source: The file it came from, for messages.
+
+        Raises:
+            WeightsError: If it is not a card, or of a newer layout.
+        """
+        try:
+            mapping = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise WeightsError(f"{source}: its card is not JSON ({error})") from error
+        if not isinstance(mapping, dict):
+            raise WeightsError(f"{source}: its card is not a JSON object")
+        schema = mapping.get("schema")
+        if not isinstance(schema, int) or schema > CARD_SCHEMA:
+            raise WeightsError(
+                f"{source}: card schema {schema!r} is newer than {CARD_SCHEMA}, which this version reads; "
+                "upgrade trilitenet"
+            )
+        try:
+            return parse(cls, mapping, source)
+        except ConfigError as error:
+            raise WeightsError(str(error)) from error
+
+
+_T = TypeVar("_T")
+
+
+def parse(cls: type[_T], mapping: Mapping[str, Any], source: str) -> _T:
+    """Build a (frozen) dataclass from a mapping, strictly.
+
+    Args:
+        cls: The dataclass; nested dataclasses are parsed alike.
+        mapping: Keys to values, as read from YAML, JSON or the command line (strings are converted).
+        source: Where it came from, for messages.
+
+    Raises:
+        ConfigError: On an unknown key (naming the nearest known one), a missing key or a value of the wrong type.
+    """
+    try:
+        return _adapter(cls).validate_python(dict(mapping))
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {_explain(cls, error)}") from error
+
+
+def _adapter(cls: type[_T]) -> TypeAdapter[_T]:
+    _forbid_extra(cls)
+    return TypeAdapter(cls)
+
+
+def _forbid_extra(cls: type[Any]) -> None:
+    """Make pydantic refuse unknown keys in ``cls`` and in every dataclass among its fields."""
+    if "__pydantic_config__" in cls.__dict__:
+        return
+    cls.__pydantic_config__ = ConfigDict(extra="forbid")
+    for field in dataclasses.fields(cls):
+        default = field.default if field.default is not dataclasses.MISSING else None
+        if dataclasses.is_dataclass(default) and not isinstance(default, type):
+            _forbid_extra(type(default))
+        factory = field.default_factory
+        if isinstance(factory, type) and dataclasses.is_dataclass(factory):
+            _forbid_extra(factory)
+
+
+def _explain(cls: type[Any], error: ValidationError) -> str:
+    first = error.errors()[0]
+    path = ".".join(str(part) for part in first["loc"])
+    if first["type"] in {"unexpected_keyword_argument", "extra_forbidden"}:
+        owner: Any = cls
+        for part in first["loc"][:-1]:
+            owner = next(
+                (f.default for f in dataclasses.fields(owner) if f.name == part), owner
+            )
+        names = [field.name for field in dataclasses.fields(owner)]
+        return f"unknown key {path!r}{did_you_mean(str(first['loc'][-1]), names)}"
+    if first["type"] in {"missing", "missing_argument"}:
+        return f"missing key {path!r}"
+    return f"{path}: {first['msg']}, got {first.get('input')!r}"

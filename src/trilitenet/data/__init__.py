@@ -1,0 +1,1 @@
+"""Labelled frames: reading, transforms, batches, synthetic scenes."""

@@ -1,0 +1,1 @@
+"""Training and evaluation: the loop, the optimiser, EMA, checkpoints, reports."""

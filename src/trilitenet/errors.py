@@ -1,0 +1,103 @@
+"""Every exception the package raises on purpose.
+
+    TriLiteNetError
+    ├── ConfigError (ValueError)          an unknown key, option, variant, task or value out of range
+    ├── ShapeError (ValueError)           an array or tensor of the wrong shape, type or range
+    ├── InputError (ValueError)           an image, video or stream that cannot be read
+    ├── DataError (ValueError)            a data set or a label file that cannot be used
+    ├── WeightsError (ValueError)         weights, a checkpoint or an exported artefact that is broken or foreign
+    ├── OutputError (OSError)             a result that cannot be written, or would overwrite another
+    ├── MissingExtraError (ImportError)   an optional dependency that is not installed; names the extra
+    ├── BackendError (RuntimeError)       a runtime or device that is missing or fails
+    └── TrainingError (RuntimeError)      a training run that cannot go on
+
+Each also derives from the built-in a caller would expect. Messages are one line that names the cause and the cure;
+the command line prints them as they are and exits 1.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from collections.abc import Iterable
+from types import ModuleType
+
+__all__ = [
+    "BackendError",
+    "ConfigError",
+    "DataError",
+    "InputError",
+    "MissingExtraError",
+    "OutputError",
+    "ShapeError",
+    "TrainingError",
+    "TriLiteNetError",
+    "WeightsError",
+    "did_you_mean",
+    "import_extra",
+]
+
+
+class TriLiteNetError(Exception):
+    """Base of every exception raised on purpose."""
+
+
+class ConfigError(TriLiteNetError, ValueError):
+    """An unknown key, option, variant or task, or a value out of range."""
+
+
+class ShapeError(TriLiteNetError, ValueError):
+    """An array or tensor of the wrong shape, type or range."""
+
+
+class InputError(TriLiteNetError, ValueError):
+    """An image, video or stream that cannot be read."""
+
+
+class DataError(TriLiteNetError, ValueError):
+    """A data set or a label file that cannot be used."""
+
+
+class WeightsError(TriLiteNetError, ValueError):
+    """Weights, a checkpoint or an exported artefact that is broken, foreign or from a newer version."""
+
+
+class OutputError(TriLiteNetError, OSError):
+    """A result that cannot be written, or that would overwrite another."""
+
+
+class MissingExtraError(TriLiteNetError, ImportError):
+    """An optional dependency that is not installed."""
+
+
+class BackendError(TriLiteNetError, RuntimeError):
+    """A runtime or a device that is missing or fails."""
+
+
+class TrainingError(TriLiteNetError, RuntimeError):
+    """A training run that cannot go on."""
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return ``"; did you mean 'x'?"`` for the nearest known word, or the list of what is known."""
+    names = sorted(known)
+    near = difflib.get_close_matches(word, names, n=1)
+    return f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(names)}"
+
+
+def import_extra(module: str, extra: str) -> ModuleType:
+    """Import an optional dependency.
+
+    Args:
+        module: The module to import, for example ``"av"``.
+        extra: The extra of this package that installs it, for example ``"video"``.
+
+    Raises:
+        MissingExtraError: If it is not installed; the message names the extra.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MissingExtraError(
+            f"this needs {module!r} ({error}); install it with: pip install 'trilitenet[{extra}]'"
+        ) from error

@@ -1,0 +1,1 @@
+"""Prediction: one backend a runtime, the predictor in front of them, and video."""

@@ -1,0 +1,1 @@
+"""The losses of Section III-C: detection, segmentation, and their weighted sum."""

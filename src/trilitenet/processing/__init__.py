@@ -1,0 +1,1 @@
+"""NumPy and OpenCV only: letterbox and its exact inverse, box maths, NMS, post-processing, drawing."""

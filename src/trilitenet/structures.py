@@ -1,0 +1,160 @@
+"""The nouns everything speaks: boxes, what a backend returns, and what a user gets. NumPy only, validated when made."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.errors import ShapeError
+
+__all__ = ["SCHEMA_VERSION", "Boxes", "Perception", "RawOutputs"]
+
+SCHEMA_VERSION: Final = "1.0"
+"""Version of the JSON that `Perception.to_dict` returns: the major number rises when a reader would break."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Boxes:
+    """Detected objects of one image.
+
+    Attributes:
+        xyxy: (N, 4) float32: left, top, right, bottom in pixels of the image, not normalised.
+        confidence: (N,) float32 in [0, 1]: objectness x class probability.
+        class_id: (N,) int64: index into the class names.
+        track_id: (N,) int64, the object's identity over the frames of a video, -1 where unknown; None without tracking.
+
+    Raises:
+        ShapeError: If the arrays do not fit each other.
+    """
+
+    xyxy: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    class_id: NDArray[np.int64]
+    track_id: NDArray[np.int64] | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.xyxy)
+        if self.xyxy.shape != (count, 4):
+            raise ShapeError(f"xyxy must be (N, 4), got {self.xyxy.shape}")
+        for name in ("confidence", "class_id", "track_id"):
+            array = getattr(self, name)
+            if array is not None and array.shape != (count,):
+                raise ShapeError(f"{name} must be ({count},) like xyxy, got {array.shape}")
+
+    def __len__(self) -> int:
+        return len(self.xyxy)
+
+    @classmethod
+    def empty(cls) -> Boxes:
+        """Return no boxes."""
+        return cls(np.zeros((0, 4), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int64))
+
+    def select(self, index: NDArray[Any]) -> Boxes:
+        """Return the boxes at ``index`` (a mask or integer positions)."""
+        return Boxes(
+            self.xyxy[index],
+            self.confidence[index],
+            self.class_id[index],
+            None if self.track_id is None else self.track_id[index],
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RawOutputs:
+    """What a backend returns for a batch of letterboxed images of H x W pixels.
+
+    Attributes:
+        detection: (B, N, 5 + classes) float32: centre x, centre y, width, height in input pixels, objectness and class
+            probabilities in [0, 1]. N may be less than all cells if the backend dropped hopeless ones. None without
+            the task.
+        drivable: (B, H, W) uint8: probability of drivable x 255 (a backend that decides itself gives 0 or 255).
+            None without the task.
+        lane: (B, H, W) uint8, likewise for lane marking.
+    """
+
+    detection: NDArray[np.float32] | None
+    drivable: NDArray[np.uint8] | None
+    lane: NDArray[np.uint8] | None
+
+    def __post_init__(self) -> None:
+        if self.detection is not None and (self.detection.ndim != 3 or self.detection.shape[2] < 6):
+            raise ShapeError(f"detection must be (B, N, 5 + classes), got {self.detection.shape}")
+        for name in ("drivable", "lane"):
+            mask = getattr(self, name)
+            if mask is not None and (mask.ndim != 3 or mask.dtype != np.uint8):
+                raise ShapeError(f"{name} must be (B, H, W) uint8, got {mask.shape} {mask.dtype}")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Perception:
+    """What the network sees in one image. A task that the model lacks is None, never an empty result.
+
+    Attributes:
+        size: (height, width) of the source image in pixels.
+        class_names: Names that ``boxes.class_id`` indexes.
+        boxes: Detected objects in pixels of the source image, best first.
+        drivable: (height, width) bool: where the vehicle may drive.
+        lane: (height, width) bool: lane markings.
+        image: (height, width, 3) uint8 RGB, the source image, for drawing; None if it was not kept.
+        source: Where the image came from (a path, or a video's name); None if unknown.
+        frame: Index of the frame in a video; None for a still image.
+        timestamp: Seconds from the start of the video; None for a still image.
+    """
+
+    size: tuple[int, int]
+    class_names: tuple[str, ...] = ("vehicle",)
+    boxes: Boxes | None = None
+    drivable: NDArray[np.bool_] | None = None
+    lane: NDArray[np.bool_] | None = None
+    image: NDArray[np.uint8] | None = dataclasses.field(default=None, repr=False)
+    source: str | None = None
+    frame: int | None = None
+    timestamp: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("drivable", "lane"):
+            mask = getattr(self, name)
+            if mask is not None and (mask.shape != self.size or mask.dtype != np.bool_):
+                raise ShapeError(f"{name} must be {self.size} bool, got {mask.shape} {mask.dtype}")
+        if self.image is not None and self.image.shape != (*self.size, 3):
+            raise ShapeError(f"image must be {(*self.size, 3)}, got {self.image.shape}")
+        if self.boxes is not None and len(self.boxes) and self.boxes.class_id.max() >= len(self.class_names):
+            raise ShapeError(
+                f"class id {int(self.boxes.class_id.max())} has no name among {self.class_names}"
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``json.dumps`` takes: the documented, versioned JSON form (masks as COCO run-length)."""
+        from trilitenet.processing.serialise import perception_to_dict
+
+        return perception_to_dict(self)
+
+    @classmethod
+    def from_dict(cls, mapping: dict[str, Any]) -> Perception:
+        """Read what `to_dict` returned (without the image).
+
+        Raises:
+            ShapeError: If it is not that form, or of a newer major version.
+        """
+        from trilitenet.processing.serialise import perception_from_dict
+
+        return perception_from_dict(mapping)
+
+    def draw(self, image: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+        """Return a copy of the image with the three tasks drawn on it.
+
+        Args:
+            image: (height, width, 3) uint8 RGB to draw on; the source image if left out.
+
+        Returns:
+            (height, width, 3) uint8 RGB.
+
+        Raises:
+            ShapeError: If there is no image, or one of another size.
+        """
+        from trilitenet.processing.drawing import draw
+
+        return draw(self, image)
