@@ -1,0 +1,201 @@
+"""TriLiteNet: one encoder, three decoders.
+
+Che and Lam, TriLiteNet: Lightweight Model for Multi-Task Visual Perception (Section III); the arithmetic that the
+paper leaves out follows the authors' public code, https://github.com/chequanghuy/TriLiteNet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from trilitenet.config import (
+    DEFAULT_ANCHORS,
+    IMAGE_MEAN,
+    IMAGE_STD,
+    MAX_STRIDE,
+    STRIDES,
+    TASKS,
+    Anchors,
+    ModelCard,
+    Task,
+    check_tasks,
+    get_variant,
+)
+from trilitenet.errors import ConfigError, ShapeError
+from trilitenet.models.attention import PCAA
+from trilitenet.models.blocks import ConvBNPReLU
+from trilitenet.models.detection import SPP, DetectionHead, LitePAN, decode_level
+from trilitenet.models.encoder import Encoder
+from trilitenet.models.segmentation import SegmentationHead
+
+__all__ = ["NetworkOutputs", "TriLiteNet", "build_network", "normalise_images"]
+
+
+class NetworkOutputs(NamedTuple):
+    """Logits of the three tasks; None for a task that the network was not built with.
+
+    Attributes:
+        detection: Levels 1/8, 1/16, 1/32: (B, 3, h, w, 5 + classes) each: x, y, w, h, objectness, classes.
+        drivable: (B, 2, H, W): background, drivable.
+        lane: (B, 2, H, W): background, lane marking.
+    """
+
+    detection: tuple[Tensor, Tensor, Tensor] | None
+    drivable: Tensor | None
+    lane: Tensor | None
+
+
+class TriLiteNet(nn.Module):
+    """The network; build it with `build_network`.
+
+    Attributes:
+        variant: ``"tiny"``, ``"small"`` or ``"base"``.
+        classes: Number of detection classes.
+        tasks: The tasks it was built with.
+        blocks: Which of ``"pcaa"``, ``"litepan"`` and ``"spp"`` it has.
+        anchors: (3, 3, 2) float32 buffer: width, height in input pixels, a level and anchor.
+        card: What is known of its weights.
+    """
+
+    anchors: Tensor
+    card: ModelCard
+
+    def __init__(
+        self,
+        variant: str,
+        classes: int,
+        tasks: tuple[Task, ...],
+        blocks: tuple[str, ...],
+        anchors: Anchors,
+    ) -> None:
+        super().__init__()
+        config = get_variant(variant)
+        c0, c1, c2, c3, c4 = config.channels
+        self.variant = variant
+        self.classes = classes
+        self.tasks = tasks
+        detects = "detection" in tasks
+        segments = "drivable" in tasks or "lane" in tasks
+        self.blocks = tuple(
+            name for name in blocks if (segments if name == "pcaa" else detects)
+        )
+
+        self.encoder = Encoder(config, deep=detects)
+        self.spp = SPP(c4) if detects and "spp" in blocks else None
+        self.litepan = LitePAN(c4, c3, paths="litepan" in blocks) if detects else None
+        self.detection = DetectionHead(c3, classes) if detects else None
+        self.pcaa = PCAA(c4) if segments and "pcaa" in blocks else None
+        self.reduce = ConvBNPReLU(c4, c2) if segments else None
+        self.drivable = SegmentationHead(c0, c1, c2) if "drivable" in tasks else None
+        self.lane = SegmentationHead(c0, c1, c2) if "lane" in tasks else None
+        self.register_buffer("anchors", torch.tensor(anchors, dtype=torch.float32).view(len(STRIDES), -1, 2))
+        self.card = ModelCard(
+            variant=variant,
+            class_names=("vehicle",) if classes == 1 else tuple(f"class_{i}" for i in range(classes)),
+            tasks=tasks,
+            blocks=self.blocks,
+            anchors=anchors,
+        )
+
+    def forward(self, image: Tensor) -> NetworkOutputs:
+        """Return the logits of every task.
+
+        Args:
+            image: (B, 3, H, W) RGB, normalised by `normalise_images`; H and W multiples of 32.
+
+        Raises:
+            ShapeError: If the shape is another.
+        """
+        if image.ndim != 4 or image.shape[1] != 3 or image.shape[2] % MAX_STRIDE or image.shape[3] % MAX_STRIDE:
+            raise ShapeError(
+                f"the network takes (B, 3, H, W) with H and W multiples of {MAX_STRIDE}, got {tuple(image.shape)}; "
+                "letterbox the image first"
+            )
+        features = self.encoder(image)
+
+        detection = None
+        if self.detection is not None:
+            assert self.litepan is not None
+            c5 = self.spp(features.c5) if self.spp is not None else features.c5
+            detection = self.detection(self.litepan(features.c3, features.c4, c5))
+
+        drivable = lane = None
+        if self.reduce is not None:
+            attended = self.pcaa(features.c3) if self.pcaa is not None else features.c3
+            f_pcaa = self.reduce(attended)
+            if self.drivable is not None:
+                drivable = self.drivable(f_pcaa, features.i1, features.i2)
+            if self.lane is not None:
+                lane = self.lane(f_pcaa, features.i1, features.i2)
+        return NetworkOutputs(detection, drivable, lane)
+
+    def decode(self, outputs: NetworkOutputs) -> Tensor:
+        """Turn detection logits into boxes.
+
+        Returns:
+            (B, N, 5 + classes): centre x, centre y, width, height in input pixels, objectness, class probabilities;
+            levels 1/8, 1/16, 1/32 in turn, within a level by anchor, row, column.
+
+        Raises:
+            ConfigError: If the network was built without detection.
+        """
+        if outputs.detection is None:
+            raise ConfigError("there is nothing to decode: this network was built without the detection task")
+        levels = zip(outputs.detection, self.anchors, STRIDES, strict=True)
+        return torch.cat([decode_level(logits, anchors, stride) for logits, anchors, stride in levels], 1)
+
+
+def build_network(
+    variant: str,
+    classes: int = 1,
+    tasks: Sequence[str] = TASKS,
+    *,
+    pcaa: bool = True,
+    litepan: bool = True,
+    spp: bool = True,
+    anchors: Anchors | None = None,
+) -> TriLiteNet:
+    """Build the network with fresh random weights.
+
+    Args:
+        variant: ``"tiny"``, ``"small"`` or ``"base"`` (Section III-B).
+        classes: Number of detection classes.
+        tasks: Any of ``"detection"``, ``"drivable"``, ``"lane"``; layers of the others do not exist.
+        pcaa: With partial class activation attention (off: the paper's ablation).
+        litepan: With LitePAN's two paths (off: only its lateral convolutions).
+        spp: With spatial pyramid pooling.
+        anchors: (width, height) in input pixels, three a level; defaults to `DEFAULT_ANCHORS`.
+
+    Raises:
+        ConfigError: On an unknown variant or task, or fewer than one class.
+    """
+    if classes < 1:
+        raise ConfigError(f"classes must be at least 1, got {classes}")
+    if isinstance(tasks, str):
+        tasks = (tasks,)
+    blocks = tuple(name for name, on in (("pcaa", pcaa), ("litepan", litepan), ("spp", spp)) if on)
+    return TriLiteNet(variant, classes, check_tasks(tuple(tasks)), blocks, anchors or DEFAULT_ANCHORS)
+
+
+def normalise_images(
+    images: Tensor,
+    mean: Sequence[float] = IMAGE_MEAN,
+    std: Sequence[float] = IMAGE_STD,
+) -> Tensor:
+    """Normalise RGB pixels: (x / 255 - mean) / std.
+
+    Args:
+        images: (B, 3, H, W) uint8 RGB.
+        mean: Of RGB / 255, a channel.
+        std: Of RGB / 255, a channel.
+
+    Returns:
+        (B, 3, H, W) float32, in the memory format of the input.
+    """
+    scale = torch.tensor([1 / (255 * s) for s in std], device=images.device).view(3, 1, 1)
+    shift = torch.tensor([-m / s for m, s in zip(mean, std, strict=True)], device=images.device).view(3, 1, 1)
+    return images.float().mul_(scale).add_(shift)

@@ -1,0 +1,339 @@
+"""Weight files: safetensors with their card inside, and the one-way import of published checkpoints.
+
+A file is read strictly: a missing, surplus or misshapen tensor is an error, never a silent random layer.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+import pickle
+import re
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from trilitenet.config import STRIDES, VARIANTS, Anchors, ModelCard, get_variant
+from trilitenet.errors import OutputError, WeightsError
+from trilitenet.models.trilitenet import TriLiteNet, build_network
+
+__all__ = [
+    "CARD_KEY",
+    "import_published",
+    "load_network",
+    "read_card",
+    "resolve_weights",
+    "save_network",
+    "shipped_weights",
+]
+
+CARD_KEY: Final = "trilitenet.card"
+"""Key of the card in the safetensors metadata."""
+
+_SHIPPED: Final = Path(__file__).parent.parent / "weights"
+
+_RENAMES: Final = (
+    (r"model\.0\.level2_0\.c1\.conv\.", "encoder.level2_down.reduce."),
+    (r"model\.0\.level3_0\.c1\.conv\.", "encoder.level3_down.reduce."),
+    (r"model\.0\.level([23])_0\.(d\d+)\.conv\.", r"encoder.level\1_down.\2."),
+    (r"model\.0\.level([23])_0\.", r"encoder.level\1_down."),
+    (r"model\.0\.level([23])\.(\d+)\.c1\.", r"encoder.level\1.\2.reduce."),
+    (r"model\.0\.level([23])\.(\d+)\.bn\.", r"encoder.level\1.\2.bn_act."),
+    (r"model\.0\.", "encoder."),
+    (r"model\.1\.cbr1\.", "encoder.c4."),
+    (r"model\.1\.cbr2\.", "encoder.c5."),
+    (r"model\.1\.spp\.cv1\.", "spp.reduce."),
+    (r"model\.1\.spp\.cv2\.", "spp.expand."),
+    (r"model\.1\.fpn\.lateral_convs\.", "litepan.laterals."),
+    (r"model\.1\.fpn\.output_convs\.", "litepan.top_down."),
+    (r"model\.1\.pan\.bottom_up_convs\.", "litepan.bottom_up."),
+    (r"model\.1\.pan\.smooth_convs\.", "litepan.smooth."),
+    (r"model\.2\.m\.", "detection.convs."),
+    (r"model\.3\.caam\.conv_cam\.", "pcaa.class_maps."),
+    (r"model\.3\.caam\.gcn\.conv1\.", "pcaa.graph.nodes."),
+    (r"model\.3\.caam\.gcn\.relu\.", "pcaa.graph.act."),
+    (r"model\.3\.caam\.gcn\.conv2\.", "pcaa.graph.channels."),
+    (r"model\.3\.caam\.proj_(query|key|value)\.", r"pcaa.\1."),
+    (r"model\.3\.caam\.conv_out\.", "pcaa.out."),
+    (r"model\.3\.caam\.relu\.", "pcaa.fuse_act."),
+    (r"model\.3\.caam\.fuse\.", "pcaa.fuse."),
+    (r"model\.3\.conv_caam\.", "reduce."),
+    (r"model\.3\.up_([12])_da\.up_conv\.", r"drivable.up\1.up."),
+    (r"model\.3\.up_([12])_ll\.up_conv\.", r"lane.up\1.up."),
+    (r"model\.3\.up_([12])_da\.", r"drivable.up\1."),
+    (r"model\.3\.up_([12])_ll\.", r"lane.up\1."),
+    (r"model\.4\.", "drivable.out."),
+    (r"model\.5\.", "lane.out."),
+)
+"""Published key prefixes and ours; the first match wins."""
+
+
+def shipped_weights() -> dict[str, Path]:
+    """Return the weight files that come with the package, by variant name."""
+    return {path.stem: path for path in sorted(_SHIPPED.glob("*.safetensors"))}
+
+
+def resolve_weights(model: str | os.PathLike[str]) -> Path:
+    """Return the file of a shipped name (``"tiny"``) or a path.
+
+    Raises:
+        WeightsError: If there is no such file.
+    """
+    shipped = shipped_weights()
+    if isinstance(model, str) and model in shipped:
+        return shipped[model]
+    path = Path(model)
+    if path.is_file():
+        return path
+    if isinstance(model, str) and model in VARIANTS:
+        raise WeightsError(f"no weights are shipped for {model!r} (shipped: {', '.join(shipped) or 'none'}); give a file")
+    what = "is a folder" if path.is_dir() else "does not exist"
+    raise WeightsError(f"{path}: {what}; give a .safetensors file or one of: {', '.join(shipped) or 'none shipped'}")
+
+
+def save_network(network: TriLiteNet, path: str | os.PathLike[str], card: ModelCard, *, half: bool = False) -> None:
+    """Write weights and card to one safetensors file, atomically.
+
+    Args:
+        network: What to save; its anchors replace the card's.
+        path: Where to; an existing file is replaced only when the new one is complete.
+        card: What is known of the weights.
+        half: Store floating-point tensors as fp16 (half the size).
+
+    Raises:
+        OutputError: If the file cannot be written.
+    """
+    path = Path(path)
+    card = dataclasses.replace(
+        card,
+        variant=network.variant,
+        tasks=network.tasks,
+        blocks=network.blocks,
+        anchors=_anchors_of(network.anchors),
+    )
+    tensors = {}
+    for name, tensor in network.state_dict().items():
+        if name == "anchors" or name.endswith("num_batches_tracked"):
+            continue
+        data = tensor.detach().to("cpu").contiguous()
+        tensors[name] = data.half() if half and data.is_floating_point() else data.clone()
+    temporary = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+        os.close(handle)
+        save_file(tensors, temporary, metadata={CARD_KEY: card.to_json(), "format": "pt"})
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except (OSError, SafetensorError) as error:
+        if temporary is not None:
+            Path(temporary).unlink(missing_ok=True)
+        raise OutputError(f"{path}: cannot write the weights ({error})") from error
+
+
+def read_card(path: str | os.PathLike[str]) -> ModelCard:
+    """Read the card of a safetensors file without its tensors.
+
+    Raises:
+        WeightsError: If the file is missing, broken, foreign or of a newer layout.
+    """
+    path = resolve_weights(path)
+    card, _ = _open(path, tensors=False)
+    return card
+
+
+def load_network(path: str | os.PathLike[str]) -> TriLiteNet:
+    """Load a network from its safetensors file, in evaluation mode on the CPU.
+
+    Args:
+        path: A file, or the name of shipped weights.
+
+    Returns:
+        The network, with its ``card``.
+
+    Raises:
+        WeightsError: If the file is missing, broken, foreign, of a newer layout, or if any tensor is missing,
+            surplus, misshapen or not finite.
+    """
+    path = resolve_weights(path)
+    card, tensors = _open(path, tensors=True)
+    blocks = {name: name in card.blocks for name in ("pcaa", "litepan", "spp")}
+    network = build_network(card.variant, card.classes, card.tasks, anchors=card.anchors, **blocks)
+    _load_strictly(network, tensors, str(path))
+    network.card = card
+    return network.eval()
+
+
+def import_published(
+    source: str | os.PathLike[str],
+    destination: str | os.PathLike[str],
+    variant: str | None = None,
+) -> ModelCard:
+    """Convert a published checkpoint (a pickled state dict) to safetensors.
+
+    The pickle is read with ``weights_only=True``: code in it is refused, never run. Anchors are taken from the file
+    (in pixels, ``model.2.anchor_grid``).
+
+    Args:
+        source: The published ``.pth`` file.
+        destination: The safetensors file to write.
+        variant: Guessed from the shapes if left out.
+
+    Returns:
+        The card that was written.
+
+    Raises:
+        WeightsError: If it is not such a checkpoint, is truncated, holds code, is another model's or another variant's.
+        OutputError: If the destination cannot be written.
+    """
+    source = Path(source)
+    state = _read_pickle(source)
+    guessed = _guess_variant(state, source)
+    if variant is not None and get_variant(variant).name != guessed:
+        raise WeightsError(f"{source}: holds the {guessed} variant, not {variant}; leave --variant out or correct it")
+    anchors = _published_anchors(state, source)
+    classes = _published_classes(state, source)
+    network = build_network(guessed, classes, anchors=_anchors_of(anchors))
+    ours = {
+        rename_published(key): value
+        for key, value in state.items()
+        if key not in {"model.2.anchors", "model.2.anchor_grid"}
+    }
+    _load_strictly(network, ours, str(source), published=True)
+    digest = hashlib.sha256(source.read_bytes()).hexdigest()
+    card = dataclasses.replace(
+        network.card,
+        training_data=("as stated by the publisher of the checkpoint",),
+        licence="as stated by the publisher of the checkpoint",
+        provenance={"imported from": source.name, "sha256": digest},
+    )
+    save_network(network, destination, card)
+    return card
+
+
+def rename_published(key: str) -> str:
+    """Return our name of a published state-dict key (the key itself if it is unknown)."""
+    for pattern, replacement in _RENAMES:
+        renamed, count = re.subn(rf"^{pattern}", replacement, key)
+        if count:
+            return renamed
+    return key
+
+
+def _anchors_of(tensor: Tensor) -> Anchors:
+    return tuple(
+        tuple((float(width), float(height)) for width, height in level)
+        for level in tensor.detach().cpu().view(len(STRIDES), -1, 2).tolist()
+    )
+
+
+def _open(path: Path, *, tensors: bool) -> tuple[ModelCard, dict[str, Tensor]]:
+    if path.stat().st_size == 0:
+        raise WeightsError(f"{path}: is empty; copy or download it again")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            if CARD_KEY not in metadata:
+                raise WeightsError(f"{path}: is safetensors, but has no trilitenet card; it is another model's")
+            card = ModelCard.from_json(metadata[CARD_KEY], str(path))
+            get_variant(card.variant)
+            keys = list(file.keys()) if tensors else []
+            return card, {key: file.get_tensor(key) for key in keys}
+    except SafetensorError as error:
+        if _is_pickle(path):
+            raise WeightsError(
+                f"{path}: is a pickled checkpoint; convert it first: trilitenet weights import {path} OUT.safetensors"
+            ) from error
+        raise WeightsError(f"{path}: is not a safetensors file, or is truncated ({error})") from error
+    except ValueError as error:
+        raise WeightsError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+
+
+def _is_pickle(path: Path) -> bool:
+    if zipfile.is_zipfile(path):
+        return True
+    with path.open("rb") as file:
+        return file.read(2) in {b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"}
+
+
+def _load_strictly(
+    network: TriLiteNet, tensors: Mapping[str, Tensor], source: str, *, published: bool = False
+) -> None:
+    own = network.state_dict()
+    optional = {key for key in own if key == "anchors" or key.endswith("num_batches_tracked")}
+    missing = [key for key in own if key not in tensors and key not in optional]
+    surplus = [key for key in tensors if key not in own]
+    if missing or surplus:
+        hint = " (it is not a TriLiteNet checkpoint)" if published and len(missing) > len(own) // 2 else ""
+        raise WeightsError(f"{source}: {_list('missing', missing)}{_list('surplus', surplus)}{hint}".rstrip("; "))
+    for key, tensor in tensors.items():
+        if tensor.shape != own[key].shape:
+            raise WeightsError(f"{source}: {key} is {tuple(tensor.shape)}, must be {tuple(own[key].shape)}")
+        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
+            raise WeightsError(f"{source}: {key} holds values that are not finite; the file is damaged")
+    network.load_state_dict({key: tensors.get(key, own[key]).to(own[key].dtype) for key in own})
+
+
+def _list(what: str, keys: list[str]) -> str:
+    if not keys:
+        return ""
+    more = f" and {len(keys) - 3} more" if len(keys) > 3 else ""
+    return f"{what} {', '.join(keys[:3])}{more}; "
+
+
+def _read_pickle(path: Path) -> dict[str, Tensor]:
+    if not path.is_file():
+        raise WeightsError(f"{path}: {'is a folder' if path.is_dir() else 'does not exist'}")
+    if path.stat().st_size == 0:
+        raise WeightsError(f"{path}: is empty; download it again")
+    try:
+        state: Any = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        text = str(error)
+        found = re.search(r"(?:GLOBAL|global) (\S+)", text)
+        if found or "Unsupported" in text:
+            name = f" ({found.group(1)})" if found else ""
+            raise WeightsError(f"{path}: holds code or objects beside tensors{name}; it was not run, nor read") from error
+        raise WeightsError(f"{path}: is not a PyTorch checkpoint, or is truncated") from error
+    except (RuntimeError, EOFError, OSError, ValueError, KeyError, IndexError, AttributeError, TypeError) as error:
+        raise WeightsError(f"{path}: is not a PyTorch checkpoint, or is truncated") from error
+    if isinstance(state, dict) and isinstance(state.get("state_dict"), dict):
+        state = state["state_dict"]
+    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()) or not state:
+        raise WeightsError(f"{path}: is a pickle, but not a state dict of tensors")
+    state = {str(key): value for key, value in state.items()}
+    if all(key.startswith("module.") for key in state):  # saved from a distributed wrapper
+        state = {key.removeprefix("module."): value for key, value in state.items()}
+    return state
+
+
+def _guess_variant(state: Mapping[str, Tensor], source: Path) -> str:
+    first = state.get("model.0.level1.conv.weight")
+    for config in VARIANTS.values():
+        if first is not None and first.shape[0] == config.channels[0]:
+            return config.name
+    raise WeightsError(f"{source}: is not a published TriLiteNet checkpoint (no known model.0.level1.conv.weight)")
+
+
+def _published_classes(state: Mapping[str, Tensor], source: Path) -> int:
+    weight = state.get("model.2.m.0.weight")
+    if weight is None or weight.ndim != 4 or weight.shape[0] % len(STRIDES) or weight.shape[0] // len(STRIDES) < 6:
+        raise WeightsError(f"{source}: missing or misshapen model.2.m.0.weight, the detection head")
+    return int(weight.shape[0]) // len(STRIDES) - 5
+
+
+def _published_anchors(state: Mapping[str, Tensor], source: Path) -> Tensor:
+    for key in ("model.2.anchors", "model.2.anchor_grid"):
+        if key not in state:
+            raise WeightsError(f"{source}: missing {key}; the boxes cannot be decoded without its anchors")
+        if state[key].numel() != 18 or not torch.isfinite(state[key]).all() or not (state[key] > 0).all():
+            raise WeightsError(f"{source}: {key} must hold 3 x 3 positive sizes, got {tuple(state[key].shape)}")
+    return state["model.2.anchor_grid"].float().view(len(STRIDES), -1, 2)
