@@ -1,0 +1,39 @@
+"""Fixtures every test may use: fixed seeds, a generator, and the driving frames where they are at hand."""
+
+from __future__ import annotations
+
+import os
+import random
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(autouse=True)
+def _seeds() -> None:
+    """Seed every global generator, so that a test's outcome never hangs on the order of the tests."""
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002 - libraries under test still draw from it
+    if "torch" in sys.modules:
+        sys.modules["torch"].manual_seed(0)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+@pytest.fixture(scope="session")
+def driving() -> Path:
+    """Root of the driving frames in the published layout; skips where they are absent.
+
+    ``TRILITENET_DATA`` names another place than ``../shared/driving``.
+    """
+    root = Path(os.environ.get("TRILITENET_DATA", ROOT.parent / "shared" / "driving"))
+    if not (root / "images").is_dir():
+        pytest.skip("the driving frames are not here; TRILITENET_DATA names their folder")
+    return root

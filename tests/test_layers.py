@@ -1,0 +1,52 @@
+"""Imports go down only. import-linter holds the layers; what it cannot see is checked here."""
+
+from __future__ import annotations
+
+import ast
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / "src" / "trilitenet"
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+
+def test_layers_hold() -> None:
+    command = shutil.which("lint-imports", path=str(Path(sys.executable).parent))
+    if command is None:
+        pytest.skip("import-linter is not installed beside this Python")
+    done = subprocess.run([command, "--no-cache"], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def imported(path: Path) -> set[str]:
+    """Return the top-level packages a file imports anywhere, functions included."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names.add(node.module.partition(".")[0])
+    return names
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
+def test_no_file_imports_what_is_banned(path: Path) -> None:
+    assert not imported(path) & {"torchvision", "ultralytics"}
+
+
+def test_no_folder_is_a_drawer_for_anything() -> None:
+    names = {path.stem for path in PACKAGE.rglob("*") if path.is_dir() or path.suffix == ".py"}
+    assert not names & {"utils", "util", "common", "misc", "helpers"}
+    assert not (PACKAGE / "export").exists(), "would collide with the public name trilitenet.export"
+
+
+def test_test_files_mirror_the_package() -> None:
+    """A test of one module lives in that module's layer: tests/<layer>/test_<module>.py."""
+    layers = {path.name for path in PACKAGE.iterdir() if path.is_dir() and (path / "__init__.py").exists()}
+    folders = {path.name for path in (ROOT / "tests").iterdir() if path.is_dir() and any(path.glob("test_*.py"))}
+    assert folders <= layers | {"parity", "benchmarks", "recipes"}
