@@ -1,0 +1,48 @@
+"""Box arithmetic, the single home of it for NumPy. Boxes are pixels in continuous coordinates, never normalised."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["box_area", "box_iou", "clip_boxes", "cxcywh_to_xyxy", "xyxy_to_cxcywh"]
+
+FloatArray = NDArray[np.floating[Any]]
+
+
+def cxcywh_to_xyxy(boxes: FloatArray) -> NDArray[np.float32]:
+    """Turn (..., 4) centre x, centre y, width, height into left, top, right, bottom, as float32."""
+    half = boxes[..., 2:] * 0.5
+    return np.concatenate([boxes[..., :2] - half, boxes[..., :2] + half], axis=-1).astype(np.float32, copy=False)
+
+
+def xyxy_to_cxcywh(boxes: FloatArray) -> NDArray[np.float32]:
+    """Turn (..., 4) left, top, right, bottom into centre x, centre y, width, height, as float32."""
+    low, high = boxes[..., :2], boxes[..., 2:]
+    return np.concatenate([(low + high) * 0.5, high - low], axis=-1).astype(np.float32, copy=False)
+
+
+def box_area(xyxy: FloatArray) -> NDArray[np.float32]:
+    """Return the (...,) areas of (..., 4) boxes in square pixels; 0 for a box turned inside out."""
+    sides = np.maximum(xyxy[..., 2:] - xyxy[..., :2], 0)
+    return np.asarray(sides[..., 0] * sides[..., 1], np.float32)
+
+
+def box_iou(first: FloatArray, second: FloatArray) -> NDArray[np.float32]:
+    """Return the (N, M) intersection over union of (N, 4) and (M, 4) xyxy boxes; 0 where both are empty."""
+    low = np.maximum(first[:, None, :2], second[None, :, :2])
+    high = np.minimum(first[:, None, 2:], second[None, :, 2:])
+    sides = np.maximum(high - low, 0)
+    intersection = sides[..., 0] * sides[..., 1]
+    union = box_area(first)[:, None] + box_area(second)[None, :] - intersection
+    iou = np.zeros(intersection.shape, np.float32)
+    np.divide(intersection, union, out=iou, where=union > 0, casting="unsafe")
+    return iou
+
+
+def clip_boxes(xyxy: FloatArray, size: tuple[int, int]) -> NDArray[np.float32]:
+    """Return (N, 4) xyxy boxes clipped to an image of ``size`` (height, width), as float32."""
+    height, width = size
+    return np.clip(xyxy, 0, np.array([width, height, width, height], np.float32)).astype(np.float32, copy=False)

@@ -1,0 +1,113 @@
+"""Images in and out of the package's one form: (height, width, 3) uint8 RGB."""
+
+from __future__ import annotations
+
+import io
+import struct
+import warnings
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
+
+from trilitenet.errors import InputError, ShapeError
+
+__all__ = ["IMAGE_SUFFIXES", "read_image", "to_rgb"]
+
+IMAGE_SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm"})
+"""File name endings, in lower case, that are taken for images in folders."""
+
+_BROKEN = (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error, Image.DecompressionBombError)
+"""What Pillow's decoders raise on broken files."""
+
+
+def read_image(image: str | Path | bytes | Image.Image | NDArray[Any]) -> NDArray[np.uint8]:
+    """Read an image of any common kind into one form.
+
+    The rotation that a camera noted in EXIF is applied. Grey, palette and CMYK images become RGB, alpha is dropped,
+    16-bit grey is scaled to 8 bit.
+
+    Args:
+        image: A path, the bytes of an image file, a Pillow image, or an array as `to_rgb` takes.
+
+    Returns:
+        (height, width, 3) uint8 RGB, contiguous.
+
+    Raises:
+        InputError: If the file is missing, empty, truncated, or no image.
+        ShapeError: If an array is of the wrong shape or type.
+    """
+    if isinstance(image, np.ndarray):
+        return to_rgb(image)
+    if isinstance(image, Image.Image):
+        return _decode(image, "the image")
+    if isinstance(image, bytes):
+        name, data = "the image", image
+    else:
+        name = str(image)
+        try:
+            data = Path(image).read_bytes()
+        except FileNotFoundError as error:
+            raise InputError(f"{name}: no such file") from error
+        except OSError as error:
+            raise InputError(f"{name}: cannot be read ({error.strerror or error})") from error
+    if not data:
+        raise InputError(f"{name}: is empty")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            opened = Image.open(io.BytesIO(data))
+    except _BROKEN as error:
+        raise InputError(f"{name}: is not an image that can be read ({_reason(error)})") from error
+    with opened:
+        return _decode(opened, name)
+
+
+def to_rgb(array: NDArray[Any]) -> NDArray[np.uint8]:
+    """Bring an array into the package's form.
+
+    Args:
+        array: (height, width, 3) uint8 **RGB** (an OpenCV image is BGR: pass ``image[..., ::-1]``), or with a fourth
+            channel, which is dropped, or (height, width) grey.
+
+    Returns:
+        (height, width, 3) uint8 RGB, contiguous; the same memory if it was so already.
+
+    Raises:
+        ShapeError: If it is none of these.
+    """
+    if array.dtype != np.uint8:
+        raise ShapeError(f"an image must be uint8 in 0 .. 255, got {array.dtype}; scale and convert it first")
+    if array.ndim == 3 and array.shape[2] == 1:
+        array = array[..., 0]
+    if array.size == 0 or array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] not in (3, 4)):
+        raise ShapeError(f"an image must be (height, width, 3) RGB, got {array.shape}")
+    if array.ndim == 2:
+        return np.repeat(array[..., None], 3, axis=2)
+    return np.ascontiguousarray(array[..., :3])
+
+
+def _decode(image: Image.Image, name: str) -> NDArray[np.uint8]:
+    try:
+        image.load()
+        image = ImageOps.exif_transpose(image)
+        if image.mode in {"I", "F"} or image.mode.startswith("I;16"):
+            return _scale_deep(np.asarray(image))
+        return np.array(image.convert("RGB"), np.uint8)
+    except _BROKEN as error:
+        raise InputError(f"{name}: is broken or truncated ({_reason(error)})") from error
+
+
+def _scale_deep(grey: NDArray[Any]) -> NDArray[np.uint8]:
+    """Scale (height, width) grey of 16 or 32 bit to 8 bit: from 0 .. 65535 if it exceeds 255 anywhere."""
+    values = grey.astype(np.float32)
+    if values.size and values.max() > 255:
+        values /= 257.0
+    return to_rgb(np.clip(np.rint(values), 0, 255).astype(np.uint8))
+
+
+def _reason(error: BaseException) -> str:
+    text = str(error).split("\n", maxsplit=1)[0]
+    return "unknown format" if text.startswith("cannot identify image file") else text or type(error).__name__

@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from trilitenet.errors import InputError, ShapeError
+from trilitenet.processing.images import read_image, to_rgb
+
+
+def gradient(height: int = 40, width: int = 60) -> np.ndarray:
+    image = np.zeros((height, width, 3), np.uint8)
+    image[..., 0] = np.linspace(0, 255, width, dtype=np.uint8)
+    image[..., 1] = np.linspace(0, 255, height, dtype=np.uint8)[:, None]
+    return image
+
+
+def encoded(image: Image.Image, format: str, **options: object) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, format, **options)
+    return buffer.getvalue()
+
+
+def test_colours_are_rgb(tmp_path: Path) -> None:
+    Image.new("RGB", (32, 16), (250, 10, 20)).save(tmp_path / "red.png")
+    Image.new("RGB", (32, 16), (250, 10, 20)).save(tmp_path / "red.jpg", quality=95)
+    for name in ("red.png", "red.jpg"):
+        image = read_image(tmp_path / name)
+        assert image.shape == (16, 32, 3)
+        assert image[..., 0].min() > 240
+        assert image[..., 2].max() < 40
+
+
+def test_kinds_of_png_agree() -> None:
+    rgb = gradient()
+    alpha = np.dstack([rgb, np.full(rgb.shape[:2], 128, np.uint8)])
+    np.testing.assert_array_equal(read_image(encoded(Image.fromarray(rgb), "PNG")), rgb)
+    np.testing.assert_array_equal(read_image(encoded(Image.fromarray(alpha), "PNG")), rgb)
+    np.testing.assert_array_equal(read_image(Image.fromarray(rgb)), rgb)
+    grey = rgb[..., 0]
+    np.testing.assert_array_equal(read_image(encoded(Image.fromarray(grey), "PNG")), np.dstack([grey] * 3))
+    deep = grey.astype(np.uint16) * 257
+    np.testing.assert_array_equal(read_image(encoded(Image.fromarray(deep), "PNG")), np.dstack([grey] * 3))
+    palette = Image.fromarray(np.full((8, 8, 3), (0, 200, 0), np.uint8)).convert("P")
+    assert read_image(encoded(palette, "PNG"))[0, 0, 1] > 180
+
+
+@pytest.mark.parametrize(("orientation", "turns"), [(3, 2), (6, 3), (8, 1)])
+def test_the_rotation_in_exif_is_applied(orientation: int, turns: int) -> None:
+    upright = gradient(48, 64)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    stored = Image.fromarray(np.ascontiguousarray(np.rot90(upright, -turns)))
+    data = encoded(stored, "JPEG", exif=exif, quality=100, subsampling=0)
+    image = read_image(data)
+    assert image.shape == upright.shape
+    assert np.abs(image.astype(int) - upright).max() <= 8
+
+
+def test_broken_files_are_named(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (200, 200, 3), dtype=np.uint8)
+    jpeg, png = encoded(Image.fromarray(noise), "JPEG"), encoded(Image.fromarray(noise), "PNG")
+    broken = {
+        "truncated.jpg": jpeg[: len(jpeg) // 2],
+        "header.jpg": jpeg[:20],
+        "truncated.png": png[: len(png) // 2],
+        "damaged.png": png[:60] + bytes(40) + png[100:],
+        "text.jpg": b"not an image\n",
+        "empty.png": b"",
+    }
+    for name, data in broken.items():
+        path = tmp_path / name
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=name):
+            read_image(path)
+    with pytest.raises(InputError, match="no such file"):
+        read_image(tmp_path / "absent.jpg")
+    with pytest.raises(InputError, match=r"cannot be read \(Is a directory\)"):
+        read_image(tmp_path)
+
+
+def test_arrays() -> None:
+    rgb = gradient()
+    assert np.shares_memory(to_rgb(rgb), rgb)
+    assert to_rgb(rgb[..., ::-1]).flags.c_contiguous
+    np.testing.assert_array_equal(to_rgb(rgb[..., :1]), to_rgb(rgb[..., 0]))
+    for wrong in (np.zeros((4, 4, 5), np.uint8), np.zeros((0, 4, 3), np.uint8), np.zeros(4, np.uint8)):
+        with pytest.raises(ShapeError, match="height, width, 3"):
+            read_image(wrong)
+    with pytest.raises(ShapeError, match="uint8"):
+        read_image(np.zeros((4, 4, 3), np.float32))
