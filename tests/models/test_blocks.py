@@ -1,0 +1,73 @@
+"""Blocks against slow, independent forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from trilitenet.models.attention import merge_bins, split_bins
+from trilitenet.models.blocks import DepthwiseConv, DepthwiseESP, StrideESP
+from trilitenet.models.encoder import Encoder
+from trilitenet.config import VARIANTS
+
+
+def test_split_bins_inverts_and_keeps_bins_apart() -> None:
+    x = torch.arange(2 * 3 * 4 * 8).view(2, 3, 4, 8).float()
+    bins = split_bins(x)
+    assert bins.shape == (2, 8, 4, 3)
+    assert torch.equal(merge_bins(bins, 4, 8), x)
+    # Bin 5 of 2 x 4 is row 1, column 1: rows 2-3, columns 2-3.
+    assert torch.equal(bins[0, 5, :, 0], x[0, 0, 2:4, 2:4].flatten())
+
+
+@pytest.mark.parametrize("channels", [16, 32, 64, 128])
+def test_esp_keeps_its_channels(channels: int) -> None:
+    x = torch.randn(1, channels, 8, 12)
+    assert DepthwiseESP(channels)(x).shape == x.shape
+    assert StrideESP(channels, 2 * channels)(x).shape == (1, 2 * channels, 4, 6)
+
+
+def test_esp_fuses_hierarchically() -> None:
+    """With one branch switched on at a time, that branch reaches exactly the sums that contain it."""
+    block = StrideESP(5, 10).eval()
+    x = torch.randn(1, 5, 16, 16)
+    reached = {}
+    for name in ("d1", "d2", "d4", "d8", "d16"):
+        with torch.no_grad():
+            for other in ("d1", "d2", "d4", "d8", "d16"):
+                conv = getattr(block, other)
+                conv.weight.fill_(0.1 if other == name else 0.0)
+            reached[name] = [bool(block(x)[0, c].abs().sum() > 0) for c in range(0, 10, 2)]
+    assert reached == {
+        "d1": [True, False, False, False, False],
+        "d2": [False, True, True, True, True],
+        "d4": [False, False, True, True, True],
+        "d8": [False, False, False, True, True],
+        "d16": [False, False, False, False, True],
+    }
+
+
+def test_pooled_images_count_the_zeros_of_the_padding() -> None:
+    outputs = Encoder(VARIANTS["tiny"]).eval()(torch.ones(1, 3, 32, 32))
+    assert outputs.i1[0, 0, 0, 0] == pytest.approx(4 / 9)
+    assert outputs.i1[0, 0, 1, 1] == pytest.approx(1)
+
+
+@pytest.mark.parametrize("dilation", [2, 4, 8, 16])
+def test_dilated_depthwise_gradient_under_bf16_autocast(dilation: int) -> None:
+    """PyTorch 2.13.0 on CPU gives a wrong weight gradient for bf16, channels-last and dilation; ours must not."""
+    torch.manual_seed(0)
+    conv = DepthwiseConv(6, 3, dilation=dilation).to(memory_format=torch.channels_last)
+    x = torch.randn(2, 6, 48, 80).to(memory_format=torch.channels_last)
+    target = torch.randn(2, 6, 48, 80)
+    conv(x).mul(target).sum().backward()
+    assert conv.weight.grad is not None
+    expected = conv.weight.grad.clone()
+    conv.weight.grad = None
+    with torch.autocast("cpu", torch.bfloat16):
+        out = conv(x.bfloat16())
+    out.float().mul(target).sum().backward()
+    error = (conv.weight.grad - expected).norm() / expected.norm()
+    assert np.isfinite(error.item())
+    assert error < 0.02

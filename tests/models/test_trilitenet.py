@@ -1,0 +1,144 @@
+"""The whole network: size, cost, shapes, tasks, decoding, and agreement with recorded published outputs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from tests.models.conftest import published_state
+from trilitenet import build_network, load_network
+from trilitenet.config import IMAGE_MEAN, IMAGE_STD, TASKS, VARIANTS
+from trilitenet.errors import ConfigError, ShapeError
+from trilitenet.models.cost import count_multiply_adds, count_parameters
+from trilitenet.models.trilitenet import NetworkOutputs, normalise_images
+from trilitenet.models.weights import import_published
+
+SUBSETS = [("detection",), ("drivable",), ("lane",), ("detection", "lane"), ("drivable", "lane"), TASKS]
+
+
+@pytest.mark.parametrize(
+    ("variant", "parameters", "multiply_adds"),
+    [("tiny", 151_413, 0.517), ("small", 592_338, 1.948), ("base", 2_350_206, 7.685)],
+)
+def test_size_and_cost_are_the_published_ones(variant: str, parameters: int, multiply_adds: float) -> None:
+    network = build_network(variant)
+    assert count_parameters(network) == parameters
+    assert round(count_multiply_adds(network, (384, 640)) / 1e9, 3) == multiply_adds
+
+
+def test_ablations_have_the_sizes_of_the_papers_table() -> None:
+    """Table "Ablation experiments": 0.45, 0.51, 0.55 and 0.59 M parameters for small."""
+    steps = [
+        build_network("small", pcaa=False, litepan=False, spp=False),
+        build_network("small", litepan=False, spp=False),
+        build_network("small", spp=False),
+        build_network("small"),
+    ]
+    assert [round(count_parameters(network) / 1e6, 2) for network in steps] == [0.45, 0.51, 0.55, 0.59]
+
+
+def test_single_tasks_have_the_sizes_of_the_papers_table() -> None:
+    """Table "multi-tasking versus single-task": 0.47, 0.18 and 0.18 M parameters for small."""
+    sizes = [round(count_parameters(build_network("small", tasks=(task,))) / 1e6, 2) for task in TASKS]
+    assert sizes == [0.47, 0.18, 0.18]
+
+
+def test_outputs_agree_with_the_published_network(golden: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    torch.save(published_state("tiny", golden), tmp_path / "tiny.pth")
+    import_published(tmp_path / "tiny.pth", tmp_path / "tiny.safetensors")
+    network = load_network(tmp_path / "tiny.safetensors")
+    image = np.random.RandomState(0).uniform(-2, 2, (2, 3, 384, 640)).astype(np.float32)
+    with torch.no_grad():
+        outputs = network(torch.from_numpy(image))
+        decoded = network.decode(outputs)
+    for name, tensor in (("decoded", decoded), ("da", outputs.drivable), ("ll", outputs.lane)):
+        assert tuple(tensor.shape) == tuple(golden[f"{name}_shape"])
+        expected = golden[name]
+        got = tensor.flatten().numpy()[golden[f"{name}_idx"]]
+        assert np.linalg.norm(got - expected) / np.linalg.norm(expected) < 1e-4
+
+
+@pytest.mark.parametrize("tasks", SUBSETS, ids="+".join)
+@pytest.mark.parametrize("classes", [1, 2, 10])
+def test_every_subset_of_tasks_and_any_class_count(tasks: tuple[str, ...], classes: int) -> None:
+    network = build_network("tiny", classes, tasks).eval()
+    with torch.no_grad():
+        outputs = network(torch.zeros(2, 3, 64, 96))
+    assert (outputs.detection is not None) == ("detection" in tasks)
+    if outputs.detection is not None:
+        assert [tuple(level.shape) for level in outputs.detection] == [
+            (2, 3, 8, 12, 5 + classes),
+            (2, 3, 4, 6, 5 + classes),
+            (2, 3, 2, 3, 5 + classes),
+        ]
+        assert network.decode(outputs).shape == (2, 3 * (96 + 24 + 6), 5 + classes)
+    else:
+        with pytest.raises(ConfigError, match="without the detection task"):
+            network.decode(outputs)
+    for task, mask in (("drivable", outputs.drivable), ("lane", outputs.lane)):
+        assert (mask is not None) == (task in tasks)
+        if mask is not None:
+            assert mask.shape == (2, 2, 64, 96)
+    prefixes = {name.split(".")[0] for name, _ in network.named_parameters()}
+    assert ("detection" in prefixes, "drivable" in prefixes, "lane" in prefixes) == tuple(t in tasks for t in TASKS)
+
+
+@pytest.mark.parametrize("size", [(32, 32), (256, 448), (640, 640), (96, 1024)])
+def test_any_multiple_of_32_is_a_legal_size(size: tuple[int, int]) -> None:
+    with torch.no_grad():
+        outputs = build_network("tiny").eval()(torch.zeros(1, 3, *size))
+    assert outputs.drivable.shape == (1, 2, *size)
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 360, 640), (3, 384, 640), (1, 1, 64, 64), (1, 384, 640, 3)])
+def test_any_other_shape_is_a_clear_error(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ShapeError, match="multiples of 32"):
+        build_network("tiny")(torch.zeros(shape))
+
+
+def test_bad_arguments_name_what_is_valid() -> None:
+    with pytest.raises(ConfigError, match="tiny, small, base"):
+        build_network("large")
+    with pytest.raises(ConfigError, match="did you mean 'lane'"):
+        build_network("tiny", tasks=("lanes",))
+    with pytest.raises(ConfigError, match="at least 1"):
+        build_network("tiny", classes=0)
+
+
+def test_decode_by_hand() -> None:
+    """One hot cell a level, worked out by the formulas of `decode_level`; order: level, anchor, row, column."""
+    network = build_network("tiny", anchors=(((8, 6),) * 3, ((30, 20),) * 3, ((90, 60),) * 3))
+    levels = [torch.zeros(1, 3, height, width, 6) for height, width in ((8, 8), (4, 4), (2, 2))]
+    levels[0][0, 2, 1, 3] = torch.tensor([2.0, -2.0, 1.0, -1.0, 3.0, 0.5])
+    decoded = network.decode(NetworkOutputs((levels[0], levels[1], levels[2]), None, None))
+    sigmoid = 1 / (1 + np.exp(-np.array([2.0, -2.0, 1.0, -1.0, 3.0, 0.5])))
+    expected = [
+        (2 * sigmoid[0] - 0.5 + 3) * 8,
+        (2 * sigmoid[1] - 0.5 + 1) * 8,
+        (2 * sigmoid[2]) ** 2 * 8,
+        (2 * sigmoid[3]) ** 2 * 6,
+        sigmoid[4],
+        sigmoid[5],
+    ]
+    np.testing.assert_allclose(decoded[0, 2 * 64 + 1 * 8 + 3].numpy(), expected, rtol=1e-5)
+    # All-zero logits: the centre of the cell, the anchor itself; the last row is level 1/32, cell (1, 1).
+    np.testing.assert_allclose(decoded[0, -1].numpy(), [48, 48, 90, 60, 0.5, 0.5], rtol=1e-6)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_initial_objectness_is_rare(variant: str) -> None:
+    network = build_network(variant, classes=2).eval()
+    with torch.no_grad():
+        decoded = network.decode(network(torch.zeros(1, 3, 64, 64)))
+    assert decoded[..., 4].mean() < 0.1
+
+
+def test_normalise_images_is_per_channel_rgb() -> None:
+    image = torch.tensor([255, 0, 128], dtype=torch.uint8).view(1, 3, 1, 1)
+    expected = (np.array([1, 0, 128 / 255]) - IMAGE_MEAN) / np.array(IMAGE_STD)
+    np.testing.assert_allclose(normalise_images(image).flatten().numpy(), expected, rtol=1e-5)

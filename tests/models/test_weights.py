@@ -1,0 +1,187 @@
+"""Weight files: round trip, strictness, and the import of published checkpoints with its errors."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load_file, save_file
+
+from tests.models.conftest import published_state
+from trilitenet import build_network, load_network
+from trilitenet.config import ModelCard, Thresholds
+from trilitenet.errors import ConfigError, OutputError, WeightsError
+from trilitenet.models.weights import CARD_KEY, import_published, read_card, rename_published, save_network
+
+
+@pytest.fixture()
+def saved(tmp_path: Path) -> Path:
+    network = build_network("tiny")
+    save_network(network, tmp_path / "net.safetensors", network.card)
+    return tmp_path / "net.safetensors"
+
+
+@pytest.mark.parametrize(
+    ("classes", "tasks", "blocks"),
+    [
+        (1, ("detection", "drivable", "lane"), {}),
+        (10, ("detection",), {"spp": False}),
+        (2, ("drivable", "lane"), {"pcaa": False}),
+        (1, ("detection", "lane"), {"litepan": False}),
+    ],
+)
+def test_round_trip(tmp_path: Path, classes: int, tasks: tuple[str, ...], blocks: dict[str, bool]) -> None:
+    torch.manual_seed(1)
+    network = build_network("tiny", classes, tasks, **blocks).eval()
+    card = dataclasses.replace(network.card, thresholds=Thresholds(confidence=0.4, lane=0.7), licence="test")
+    save_network(network, tmp_path / "net.safetensors", card)
+    loaded = load_network(tmp_path / "net.safetensors")
+    assert loaded.card.thresholds == card.thresholds
+    assert loaded.card == read_card(tmp_path / "net.safetensors")
+    assert loaded.tasks == network.tasks
+    assert loaded.blocks == network.blocks
+    image = torch.randn(1, 3, 64, 64)
+    with torch.no_grad():
+        for got, expected in zip(loaded(image), network(image), strict=True):
+            assert (got is None) == (expected is None)
+            if isinstance(got, torch.Tensor):
+                assert torch.equal(got, expected)
+
+
+def test_half_precision_halves_the_file(tmp_path: Path) -> None:
+    network = build_network("tiny")
+    save_network(network, tmp_path / "full.safetensors", network.card)
+    save_network(network, tmp_path / "half.safetensors", network.card, half=True)
+    assert (tmp_path / "half.safetensors").stat().st_size < 0.6 * (tmp_path / "full.safetensors").stat().st_size
+    weight = load_network(tmp_path / "half.safetensors").encoder.level1.conv.weight
+    torch.testing.assert_close(weight, network.encoder.level1.conv.weight, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("change", ["missing", "surplus", "shape", "nan"])
+def test_a_damaged_state_is_never_loaded(saved: Path, change: str) -> None:
+    tensors = load_file(saved)
+    key = "drivable.up1.conv1.conv.weight"
+    if change == "missing":
+        del tensors[key]
+    elif change == "surplus":
+        tensors["extra.weight"] = torch.zeros(1)
+    elif change == "shape":
+        tensors[key] = tensors[key][:1].contiguous()
+    else:
+        tensors[key][0] = torch.nan
+    save_file(tensors, saved, metadata={CARD_KEY: read_card(saved).to_json()})
+    expected = {"missing": "missing drivable", "surplus": "surplus extra", "shape": "must be", "nan": "not finite"}
+    with pytest.raises(WeightsError, match=expected[change]):
+        load_network(saved)
+
+
+def test_files_that_are_not_weights(tmp_path: Path, saved: Path) -> None:
+    (tmp_path / "empty.safetensors").touch()
+    (tmp_path / "text.safetensors").write_text("not weights at all")
+    (tmp_path / "cut.safetensors").write_bytes(saved.read_bytes()[:20_000])
+    torch.save({"a": torch.zeros(1)}, tmp_path / "pickle.pth")
+    save_file({"a": torch.zeros(1)}, tmp_path / "foreign.safetensors")
+    newer = dataclasses.replace(read_card(saved), schema=99)
+    save_file(load_file(saved), tmp_path / "newer.safetensors", metadata={CARD_KEY: newer.to_json()})
+    cases = {
+        "empty.safetensors": "is empty",
+        "text.safetensors": "not a safetensors file",
+        "cut.safetensors": "truncated",
+        "pickle.pth": "weights import",
+        "foreign.safetensors": "no trilitenet card",
+        "newer.safetensors": "upgrade trilitenet",
+        "absent.safetensors": "does not exist",
+        ".": "is a folder",
+    }
+    for name, message in cases.items():
+        with pytest.raises(WeightsError, match=message):
+            load_network(tmp_path / name)
+
+
+def test_an_unknown_key_in_the_card_names_the_nearest(saved: Path) -> None:
+    card = ModelCard("tiny").to_json().replace('"licence"', '"license"')
+    save_file(load_file(saved), saved, metadata={CARD_KEY: card})
+    with pytest.raises(WeightsError, match="did you mean 'licence'"):
+        load_network(saved)
+
+
+def test_saving_where_one_cannot_is_one_clear_error(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    network = build_network("tiny")
+    with pytest.raises(OutputError, match="cannot write"):
+        save_network(network, tmp_path / "file" / "net.safetensors", network.card)
+
+
+@pytest.mark.parametrize("variant", ["tiny", "small", "base"])
+def test_import_of_every_variant(variant: str, golden: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    torch.save(published_state(variant, golden), tmp_path / "published.pth")
+    card = import_published(tmp_path / "published.pth", tmp_path / "ours.safetensors")
+    assert card.variant == variant
+    assert card.anchors[0][0] == (4.0, 12.0)
+    assert load_network(tmp_path / "ours.safetensors").anchors[2, 2].tolist() == [124.0, 412.0]
+
+
+def test_anchors_come_from_the_file(golden: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    state = published_state("tiny", golden)
+    state["model.2.anchor_grid"] = torch.arange(1, 19).float().view(3, 1, 3, 1, 1, 2)
+    torch.save(state, tmp_path / "published.pth")
+    import_published(tmp_path / "published.pth", tmp_path / "ours.safetensors")
+    assert load_network(tmp_path / "ours.safetensors").anchors.flatten().tolist() == list(range(1, 19))
+
+
+def test_every_published_key_has_a_name_of_ours(golden: dict[str, NDArray[Any]]) -> None:
+    ours = set(build_network("base").state_dict())
+    for key in published_state("base", golden):
+        if "anchor" not in key:
+            assert rename_published(key) in ours
+
+
+class _Code:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (os.system, ("touch /tmp/must-not-exist",))
+
+
+def test_import_refuses_what_is_not_a_checkpoint(golden: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    state = published_state("tiny", golden)
+    torch.save(state, tmp_path / "good.pth")
+    (tmp_path / "cut.pth").write_bytes((tmp_path / "good.pth").read_bytes()[:100_000])
+    (tmp_path / "text.pth").write_text("hello")
+    (tmp_path / "empty.pth").touch()
+    (tmp_path / "code.pth").write_bytes(pickle.dumps({"a": _Code()}))
+    torch.save({"zip": _Code()}, tmp_path / "zipcode.pth")
+    torch.save([1, 2], tmp_path / "list.pth")
+    torch.save({"conv.weight": torch.zeros(1)}, tmp_path / "foreign.pth")
+    torch.save({k: v for k, v in state.items() if "caam.fuse" not in k}, tmp_path / "missing.pth")
+    torch.save({**state, "model.9.weight": torch.zeros(1)}, tmp_path / "surplus.pth")
+    torch.save({k: v for k, v in state.items() if "anchor_grid" not in k}, tmp_path / "anchors.pth")
+    cases = {
+        "cut.pth": "truncated",
+        "text.pth": "not a PyTorch checkpoint",
+        "empty.pth": "is empty",
+        "code.pth": "holds code",
+        "zipcode.pth": "holds code",
+        "list.pth": "not a state dict",
+        "foreign.pth": "not a published TriLiteNet checkpoint",
+        "missing.pth": "missing pcaa.fuse",
+        "surplus.pth": "surplus model.9",
+        "anchors.pth": "missing model.2.anchor_grid",
+        "absent.pth": "does not exist",
+    }
+    for name, message in cases.items():
+        with pytest.raises(WeightsError, match=message):
+            import_published(tmp_path / name, tmp_path / "out.safetensors")
+        assert not (tmp_path / "out.safetensors").exists()
+
+
+def test_import_refuses_the_wrong_variant(golden: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    torch.save(published_state("tiny", golden), tmp_path / "tiny.pth")
+    with pytest.raises(WeightsError, match="holds the tiny variant, not base"):
+        import_published(tmp_path / "tiny.pth", tmp_path / "out.safetensors", variant="base")
+    with pytest.raises(ConfigError, match="unknown variant"):
+        import_published(tmp_path / "tiny.pth", tmp_path / "out.safetensors", variant="huge")
