@@ -1,0 +1,141 @@
+"""``dataset.yaml``: what a data set in the published layout says of itself. The file is optional."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from trilitenet.config import TASKS, Task, parse
+from trilitenet.errors import ConfigError, DataError
+
+__all__ = [
+    "DESCRIPTION_FILE",
+    "VEHICLES",
+    "DatasetDescription",
+    "MaskMeaning",
+    "class_table",
+    "read_description",
+    "write_description",
+]
+
+DESCRIPTION_FILE: Final = "dataset.yaml"
+
+VEHICLES: Final = ("car", "truck", "bus", "train", "vehicle")
+"""Categories that count as ``vehicle`` unless a table says otherwise (the published choice: car, truck, bus, train)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MaskMeaning:
+    """What the values of a stored mask mean.
+
+    Attributes:
+        above: Values above this are foreground (the published rule: above 1).
+        values: Names of the values, for readers: ``{255: "direct", 127: "alternative"}``.
+        ignore: Values that are neither foreground nor background.
+    """
+
+    above: int = 1
+    values: dict[int, str] = dataclasses.field(default_factory=dict)
+    ignore: tuple[int, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class DatasetDescription:
+    """The content of ``dataset.yaml``.
+
+    Attributes:
+        name: What the data set is called.
+        classes: Class name to the categories in the annotation files that belong to it, in the order of class ids.
+        ignore: Categories whose boxes are neither object nor background.
+        splits: The splits there are; empty = whatever folders exist.
+        tasks: Tasks that are labelled at all; the files of others are not read.
+        attributes: Names of the attributes each image carries.
+        drivable: What the values of the drivable masks mean.
+        lane: What the values of the lane masks mean.
+        ego_mask: A mask (path from the data set's root) of the own car, non-zero = own car; one for all images.
+        ego_masks: The same by camera: a prefix of the image's name to a mask's path.
+        licence: Licence of the images and labels.
+        source: Where it came from, in words.
+    """
+
+    name: str = ""
+    classes: dict[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    ignore: tuple[str, ...] = ()
+    splits: tuple[str, ...] = ()
+    tasks: tuple[Task, ...] = TASKS
+    attributes: tuple[str, ...] = ()
+    drivable: MaskMeaning = MaskMeaning()
+    lane: MaskMeaning = MaskMeaning()
+    ego_mask: str | None = None
+    ego_masks: dict[str, str] = dataclasses.field(default_factory=dict)
+    licence: str = ""
+    source: str = ""
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Class names in the order of their ids; ``("vehicle",)`` if the file names none."""
+        return tuple(self.classes) or ("vehicle",)
+
+
+def class_table(
+    class_names: Sequence[str], classes: Mapping[str, Sequence[str]] | None = None
+) -> dict[str, int]:
+    """Return category -> class id.
+
+    A class holds the categories that ``classes`` lists for it, else the category of its own name; ``vehicle`` alone
+    also holds car, truck, bus and train.
+
+    Raises:
+        DataError: If one category belongs to two classes.
+    """
+    table: dict[str, int] = {}
+    for index, name in enumerate(class_names):
+        default = VEHICLES if name == "vehicle" else (name,)
+        for category in (classes or {}).get(name, default):
+            if table.setdefault(category, index) != index:
+                raise DataError(f"category {category!r} belongs to both {class_names[table[category]]!r} and {name!r}")
+    return table
+
+
+def read_description(root: Path) -> DatasetDescription:
+    """Read ``root/dataset.yaml``; without the file, return the defaults.
+
+    Raises:
+        DataError: If it is not YAML, or has an unknown key or a wrong value.
+    """
+    path = root / DESCRIPTION_FILE
+    if not path.is_file():
+        return DatasetDescription(name=root.name)
+    try:
+        content: Any = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: not YAML ({' '.join(str(error).split())})") from error
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: must be a mapping of keys, got {type(content).__name__}")
+    try:
+        return parse(DatasetDescription, content, str(path))
+    except ConfigError as error:
+        raise DataError(str(error)) from error
+
+
+def write_description(root: Path, description: DatasetDescription) -> None:
+    """Write ``root/dataset.yaml``, without the keys that hold their default."""
+    default = dataclasses.asdict(DatasetDescription())
+    content = {
+        key: _plain(value) for key, value in dataclasses.asdict(description).items() if value != default[key]
+    }
+    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)
+    (root / DESCRIPTION_FILE).write_text(text, encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    """Return ``value`` with tuples as lists, which YAML writes without tags."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return value

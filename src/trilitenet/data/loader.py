@@ -1,0 +1,231 @@
+"""Batches in an order, and with an augmentation, that depend on (seed, epoch, position) alone.
+
+Whatever the number of workers, and whether an epoch is run through or taken up in its middle, the same batches come.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import torch.utils.data
+from numpy.typing import NDArray
+
+from trilitenet.data.batches import Batch, collate
+from trilitenet.data.reading import MixedDataset, SampleSource
+from trilitenet.data.sample import Sample
+from trilitenet.data.transforms import Transform
+from trilitenet.errors import ConfigError
+
+__all__ = ["Loader", "build_loader", "epoch_order"]
+
+_ORDER_STREAM: Final = 0
+_SAMPLE_STREAM: Final = 1
+"""Random streams of the sample order and of the augmentation are kept apart."""
+
+
+def epoch_order(
+    count: int, *, seed: int, epoch: int, weights: NDArray[np.float64] | None = None, length: int | None = None
+) -> NDArray[np.int64]:
+    """Return the indices of one epoch, shuffled.
+
+    With weights, sample ``i`` comes ``length * weights[i] / weights.sum()`` times, rounded down or up at random
+    (systematic sampling); without, every sample comes once (if ``length`` is left out).
+
+    Args:
+        count: Number of samples.
+        seed: Of the run.
+        epoch: From 0.
+        weights: (count,) relative weights, not negative.
+        length: Number of indices; ``count`` if left out.
+
+    Returns:
+        (length,) int64.
+    """
+    rng = np.random.default_rng([seed, _ORDER_STREAM, epoch])
+    length = count if length is None else length
+    shares = np.full(count, length / count) if weights is None else weights / weights.sum() * length
+    shuffled = rng.permutation(count)
+    # One random offset, then a pick at each whole number along the summed shares.
+    ends = np.cumsum(shares[shuffled])
+    ends *= length / ends[-1]
+    picks = np.searchsorted(ends, np.arange(length) + rng.random() * (1 - 1e-6), side="right")
+    order: NDArray[np.int64] = shuffled[np.minimum(picks, count - 1)].astype(np.int64)
+    rng.shuffle(order)
+    return order
+
+
+@dataclasses.dataclass(frozen=True)
+class _Draw:
+    """What a worker needs to make one sample: where it stands in the run and which sample it is."""
+
+    epoch: int
+    position: int
+    index: int
+
+
+class _Samples(torch.utils.data.Dataset[Sample]):
+    """Transformed samples by `_Draw`."""
+
+    def __init__(self, dataset: SampleSource, transform: Transform, seed: int) -> None:
+        self._dataset = dataset
+        self._transform = transform
+        self._seed = seed
+
+    def __getitem__(self, draw: _Draw) -> Sample:
+        rng = np.random.default_rng([self._seed, _SAMPLE_STREAM, draw.epoch, draw.position])
+        return self._transform(self._dataset[draw.index], rng, self._other)
+
+    def _other(self, rng: np.random.Generator) -> Sample:
+        return self._dataset[int(rng.integers(len(self._dataset)))]
+
+
+class _Plan(torch.utils.data.Sampler[list[_Draw]]):
+    """The batches still to come of one epoch."""
+
+    def __init__(self) -> None:
+        self.batches: list[list[_Draw]] = []
+
+    def __iter__(self) -> Iterator[list[_Draw]]:
+        return iter(self.batches)
+
+    def __len__(self) -> int:
+        return len(self.batches)
+
+
+class Loader:
+    """Batches of a data set; made by `build_loader`.
+
+    Args:
+        dataset: Where samples come from.
+        transform: Brings each sample to one canvas.
+        batch_size: Samples a batch.
+        seed: Of order and augmentation.
+        shuffle: Shuffle (and weigh) the samples; else the data set's own order.
+        weights: (N,) relative weights of the samples.
+        samples_per_epoch: Length of an epoch; the number of samples if left out.
+        drop_last: Leave out a last batch that is not full.
+        workers: Processes that read ahead; 0 reads in this one.
+        pin_memory: Put batches into page-locked memory, for a GPU.
+    """
+
+    def __init__(
+        self,
+        dataset: SampleSource,
+        transform: Transform,
+        *,
+        batch_size: int,
+        seed: int,
+        shuffle: bool,
+        weights: NDArray[np.float64] | None,
+        samples_per_epoch: int | None,
+        drop_last: bool,
+        workers: int,
+        pin_memory: bool,
+    ) -> None:
+        self.dataset = dataset
+        self.batch_size = batch_size
+        self.seed = seed
+        self._shuffle = shuffle
+        self._weights = weights
+        self._length = samples_per_epoch or len(dataset)
+        self._drop_last = drop_last
+        self._plan = _Plan()
+        more: dict[str, Any] = {"persistent_workers": True, "prefetch_factor": 4} if workers else {}
+        self._loader: torch.utils.data.DataLoader[Batch] = torch.utils.data.DataLoader(
+            _Samples(dataset, transform, seed),  # type: ignore[arg-type]
+            batch_sampler=self._plan,
+            collate_fn=collate,
+            num_workers=workers,
+            pin_memory=pin_memory,
+            worker_init_fn=_start_worker,
+            **more,
+        )
+
+    def __len__(self) -> int:
+        """Number of batches an epoch."""
+        whole, rest = divmod(self._length, self.batch_size)
+        return whole + bool(rest and not self._drop_last)
+
+    def __iter__(self) -> Iterator[Batch]:
+        return self.epoch(0)
+
+    def epoch(self, epoch: int, *, start: int = 0) -> Iterator[Batch]:
+        """Return the batches of one epoch.
+
+        Args:
+            epoch: From 0.
+            start: Leave out the first so many batches, to take an epoch up in its middle.
+        """
+        if self._shuffle:
+            order = epoch_order(
+                len(self.dataset), seed=self.seed, epoch=epoch, weights=self._weights, length=self._length
+            )
+        else:
+            order = np.arange(self._length, dtype=np.int64)
+        draws = [_Draw(epoch, position, int(index)) for position, index in enumerate(order)]
+        batches = [draws[first : first + self.batch_size] for first in range(0, len(draws), self.batch_size)]
+        self._plan.batches = batches[start : len(self)]
+        return iter(self._loader)
+
+
+def build_loader(
+    dataset: SampleSource,
+    transform: Transform,
+    *,
+    batch_size: int,
+    seed: int = 0,
+    shuffle: bool = True,
+    weights: NDArray[np.float64] | None = None,
+    samples_per_epoch: int | None = None,
+    drop_last: bool | None = None,
+    workers: int = 0,
+    pin_memory: bool = False,
+) -> Loader:
+    """Build a deterministic loader.
+
+    Args:
+        dataset: A `DrivingDataset`, a `MixedDataset` (whose weights are used) or anything alike.
+        transform: `TrainTransform` or `EvalTransform`.
+        batch_size: Samples a batch.
+        seed: Of order and augmentation.
+        shuffle: Shuffle the samples each epoch; False keeps the data set's order and ignores weights.
+        weights: (N,) relative sampling weights, for example of `sampling_weights`; those of a `MixedDataset` if left
+            out.
+        samples_per_epoch: Length of an epoch when shuffling; the number of samples if left out.
+        drop_last: Leave out a last batch that is not full; if left out, when shuffling and another batch is left.
+        workers: Processes that read ahead; 0 reads in this one.
+        pin_memory: Put batches into page-locked memory, for a GPU.
+
+    Raises:
+        ConfigError: If a number is out of range, or the weights do not fit the data set.
+    """
+    if batch_size < 1 or workers < 0:
+        raise ConfigError(f"batch_size must be at least 1 and workers 0, got {batch_size} and {workers}")
+    if samples_per_epoch is not None and (samples_per_epoch < 1 or not shuffle):
+        raise ConfigError("samples_per_epoch must be at least 1, and needs shuffle")
+    if weights is None and isinstance(dataset, MixedDataset):
+        own = dataset.weights
+        weights = None if (own == own[0]).all() else own
+    if weights is not None and (weights.shape != (len(dataset),) or not (weights >= 0).all() or not weights.any()):
+        raise ConfigError(f"weights must be {len(dataset)} numbers, none negative and one above 0")
+    return Loader(
+        dataset,
+        transform,
+        batch_size=batch_size,
+        seed=seed,
+        shuffle=shuffle,
+        weights=weights,
+        samples_per_epoch=samples_per_epoch,
+        drop_last=(shuffle and (samples_per_epoch or len(dataset)) >= batch_size) if drop_last is None else drop_last,
+        workers=workers,
+        pin_memory=pin_memory,
+    )
+
+
+def _start_worker(worker: int) -> None:
+    """Keep a worker to one core: the workers are the parallelism."""
+    cv2.setNumThreads(1)

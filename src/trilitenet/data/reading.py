@@ -1,0 +1,414 @@
+"""Reading the published layout.
+
+    ROOT/images/{split}/NAME.jpg
+    ROOT/det_annotations/{split}/NAME.json        BDD100K's old per-image form
+    ROOT/da_seg_annotations/{split}/NAME.png      drivable area, above 1 = drivable
+    ROOT/ll_seg_annotations/{split}/NAME.png      lane marking, above 1 = marking
+    ROOT/dataset.yaml                             optional: classes, mask values, ego mask, licence
+    ROOT/index.csv                                optional: name, split and further columns, which become attributes
+
+A missing annotation file means 'not labelled' for that image and task. Objects with ``attributes.crowd: true`` are
+ignored regions.
+"""
+
+from __future__ import annotations
+
+import csv
+import functools
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.config import Task
+from trilitenet.data.description import DatasetDescription, MaskMeaning, class_table, read_description
+from trilitenet.data.sample import Sample
+from trilitenet.errors import DataError
+
+__all__ = [
+    "DETECTION_FOLDER",
+    "DRIVABLE_FOLDER",
+    "IMAGE_ENDINGS",
+    "IMAGE_FOLDER",
+    "LANE_FOLDER",
+    "DrivingDataset",
+    "MixedDataset",
+    "SampleSource",
+    "decode_image",
+    "decode_mask",
+    "parse_annotation",
+    "sampling_weights",
+]
+
+IMAGE_FOLDER: Final = "images"
+DETECTION_FOLDER: Final = "det_annotations"
+DRIVABLE_FOLDER: Final = "da_seg_annotations"
+LANE_FOLDER: Final = "ll_seg_annotations"
+IMAGE_ENDINGS: Final = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
+
+
+class SampleSource(Protocol):
+    """Anything that samples can be taken from by index."""
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names that ``Sample.class_id`` indexes."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> Sample: ...
+
+    def attributes(self, index: int) -> dict[str, str]:
+        """Return the attributes of a sample without decoding its image."""
+
+
+def decode_image(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+    """Decode an encoded image (orientation tag applied) into (H, W, 3) uint8 RGB.
+
+    Raises:
+        DataError: If it is not an image, or a broken one.
+    """
+    buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes) else data
+    image = cv2.imdecode(buffer, cv2.IMREAD_COLOR) if len(buffer) else None
+    if image is None:
+        raise DataError(f"{name}: not an image that can be decoded; run `trilitenet data check` on the data set")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)  # type: ignore[no-any-return]
+
+
+def decode_mask(
+    data: bytes | NDArray[np.uint8], name: str, meaning: MaskMeaning
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """Decode an encoded mask into (H, W) uint8 {0, 1} and, if it has ignored values, where it is valid.
+
+    Raises:
+        DataError: If it is not an image, or a broken one.
+    """
+    buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes) else data
+    grey = cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE) if len(buffer) else None
+    if grey is None:
+        raise DataError(f"{name}: not a mask that can be decoded; run `trilitenet data check` on the data set")
+    valid = ~np.isin(grey, meaning.ignore) if meaning.ignore else None
+    mask = cv2.threshold(grey, meaning.above, 1, cv2.THRESH_BINARY)[1]
+    if valid is not None:
+        mask[~valid] = 0
+        if valid.all():
+            valid = None
+    return mask, valid
+
+
+def parse_annotation(
+    content: Any, table: Mapping[str, int], ignore: Sequence[str], size: tuple[int, int], name: str
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32], dict[str, str]]:
+    """Take boxes and attributes from an annotation in BDD100K's old per-image form.
+
+    Args:
+        content: The parsed JSON.
+        table: Category -> class id; other categories are left out.
+        ignore: Categories that are ignored regions.
+        size: (height, width) of the image; boxes are clipped to it and dropped when nothing is left.
+        name: For messages.
+
+    Returns:
+        (N, 4) boxes, (N,) class ids, (M, 4) ignored boxes, the image's attributes.
+
+    Raises:
+        DataError: If it has another form.
+    """
+    boxes: list[tuple[float, float, float, float]] = []
+    class_id: list[int] = []
+    ignored: list[tuple[float, float, float, float]] = []
+    height, width = size
+    try:
+        for frame in content["frames"]:
+            for item in frame.get("objects") or ():
+                category = item["category"]
+                box = item.get("box2d")
+                if box is None:
+                    continue
+                crowd = bool((item.get("attributes") or {}).get("crowd", False)) and category in table
+                if not crowd and category not in table and category not in ignore:
+                    continue
+                x1, y1 = max(float(box["x1"]), 0.0), max(float(box["y1"]), 0.0)
+                x2, y2 = min(float(box["x2"]), float(width)), min(float(box["y2"]), float(height))
+                if not (x2 > x1 and y2 > y1):
+                    continue
+                if crowd or category not in table:
+                    ignored.append((x1, y1, x2, y2))
+                else:
+                    boxes.append((x1, y1, x2, y2))
+                    class_id.append(table[category])
+        attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise DataError(f"{name}: not an annotation in the per-image form ({error!r})") from error
+    return (
+        np.array(boxes, np.float32).reshape(-1, 4),
+        np.array(class_id, np.int64),
+        np.array(ignored, np.float32).reshape(-1, 4),
+        attributes,
+    )
+
+
+class DrivingDataset:
+    """One split of a data set in the published layout.
+
+    Args:
+        root: The folder that holds ``images`` and the annotation folders.
+        split: A folder name under each of them.
+        class_names: Detection classes in the order of their ids; those of ``dataset.yaml``, else ``("vehicle",)``.
+        classes: Class name -> categories in the files; that of ``dataset.yaml``, else see `class_table`.
+        tasks: Read the labels of these alone; those of ``dataset.yaml``.
+        names: Keep only these images, in this order.
+
+    Raises:
+        DataError: If the split has no images.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        split: str,
+        *,
+        class_names: Sequence[str] | None = None,
+        classes: Mapping[str, Sequence[str]] | None = None,
+        tasks: Sequence[Task] | None = None,
+        names: Sequence[str] | None = None,
+    ) -> None:
+        self.root = Path(root)
+        self.split = split
+        self.description: DatasetDescription = read_description(self.root)
+        self._class_names = tuple(class_names or self.description.class_names)
+        self._table = class_table(self._class_names, classes or self.description.classes)
+        self._tasks = tuple(tasks if tasks is not None else self.description.tasks)
+        self._files = _image_files(self.root, split)
+        if names is None:
+            self.names: list[str] = sorted(self._files)
+        else:
+            missing = [name for name in names if name not in self._files]
+            if missing:
+                raise DataError(f"{self.root}: no image {missing[0]!r} in split {split!r}")
+            self.names = list(names)
+        self._extra = _index_attributes(self.root, split)
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names that ``Sample.class_id`` indexes."""
+        return self._class_names
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __iter__(self) -> Iterator[Sample]:
+        return (self[index] for index in range(len(self)))
+
+    def image_path(self, index: int) -> Path:
+        """Return the path of an image."""
+        return self.root / IMAGE_FOLDER / self.split / self._files[self.names[index]]
+
+    def attributes(self, index: int) -> dict[str, str]:
+        """Return the attributes of an image without decoding it."""
+        name = self.names[index]
+        content = self._annotation(name)
+        own = content.get("attributes") if isinstance(content, dict) else None
+        return {str(key): str(value) for key, value in (own or {}).items()} | self._extra.get(name, {})
+
+    def __getitem__(self, index: int) -> Sample:
+        """Read a sample.
+
+        Raises:
+            DataError: If a file is broken, or a mask has another size than its image.
+        """
+        name = self.names[index]
+        path = self.image_path(index)
+        image = decode_image(np.fromfile(path, np.uint8), str(path))
+        size = image.shape[:2]
+        boxes = class_id = None
+        ignored = np.zeros((0, 4), np.float32)
+        attributes: dict[str, str] = {}
+        content = self._annotation(name)
+        if content is not None:
+            boxes, class_id, ignored, attributes = parse_annotation(
+                content, self._table, self.description.ignore, size, name
+            )
+            if "detection" not in self._tasks:
+                boxes = class_id = None
+        drivable, drivable_valid = self._mask("drivable", name, size)
+        lane, lane_valid = self._mask("lane", name, size)
+        valid = self._ego(name, size)
+        for other in (drivable_valid, lane_valid):
+            if other is not None:
+                valid = other if valid is None else valid & other
+        return Sample(
+            name=name,
+            image=image,
+            boxes=boxes,
+            class_id=class_id,
+            ignored=ignored,
+            drivable=drivable,
+            lane=lane,
+            valid=valid,
+            attributes=attributes | self._extra.get(name, {}),
+        )
+
+    def _annotation(self, name: str) -> Any:
+        path = self.root / DETECTION_FOLDER / self.split / f"{name}.json"
+        try:
+            return json.loads(path.read_bytes())
+        except FileNotFoundError:
+            return None
+        except ValueError as error:
+            raise DataError(f"{path}: not JSON ({error})") from error
+
+    def _mask(
+        self, task: Task, name: str, size: tuple[int, int]
+    ) -> tuple[NDArray[np.uint8] | None, NDArray[np.bool_] | None]:
+        if task not in self._tasks:
+            return None, None
+        folder, meaning = (
+            (DRIVABLE_FOLDER, self.description.drivable)
+            if task == "drivable"
+            else (LANE_FOLDER, self.description.lane)
+        )
+        path = self.root / folder / self.split / f"{name}.png"
+        try:
+            data = np.fromfile(path, np.uint8)
+        except FileNotFoundError:
+            return None, None
+        mask, valid = decode_mask(data, str(path), meaning)
+        if mask.shape != size:
+            raise DataError(f"{path}: mask of {mask.shape[1]}x{mask.shape[0]} for an image of {size[1]}x{size[0]}")
+        return mask, valid
+
+    def _ego(self, name: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+        masks = self.description.ego_masks
+        path = next((masks[prefix] for prefix in sorted(masks, key=len, reverse=True) if name.startswith(prefix)), None)
+        path = path or self.description.ego_mask
+        return None if path is None else _ego_mask(self.root / path, size)
+
+
+class MixedDataset:
+    """Several data sets as one.
+
+    Args:
+        parts: (data set, weight) pairs. A weight multiplies how often each of that data set's samples is drawn; all
+            equal = every sample once an epoch.
+
+    Raises:
+        DataError: If there is none, a weight is not positive, or the class names differ.
+    """
+
+    def __init__(self, parts: Sequence[tuple[SampleSource, float]]) -> None:
+        if not parts:
+            raise DataError("at least one data set is needed")
+        names = parts[0][0].class_names
+        for dataset, weight in parts:
+            if not weight > 0:
+                raise DataError(f"a data set's weight must be above 0, got {weight}")
+            if dataset.class_names != names:
+                raise DataError(
+                    f"data sets with different classes, {names} and {dataset.class_names}; give both the same `classes`"
+                )
+        self.parts = list(parts)
+        self._ends = np.cumsum([len(dataset) for dataset, _ in parts])
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names that ``Sample.class_id`` indexes."""
+        return self.parts[0][0].class_names
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """(N,) float64: the weight of each sample."""
+        return np.concatenate([np.full(len(dataset), weight, np.float64) for dataset, weight in self.parts])
+
+    def __len__(self) -> int:
+        return int(self._ends[-1])
+
+    def __getitem__(self, index: int) -> Sample:
+        dataset, inner = self._find(index)
+        return dataset[inner]
+
+    def attributes(self, index: int) -> dict[str, str]:
+        """Return the attributes of a sample without decoding its image."""
+        dataset, inner = self._find(index)
+        return dataset.attributes(inner)
+
+    def _find(self, index: int) -> tuple[SampleSource, int]:
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        part = int(np.searchsorted(self._ends, index, side="right"))
+        return self.parts[part][0], index - (int(self._ends[part - 1]) if part else 0)
+
+
+def sampling_weights(dataset: SampleSource, table: Mapping[str, Mapping[str, float]]) -> NDArray[np.float64]:
+    """Return how often each sample is to be drawn, from its attributes.
+
+    Args:
+        dataset: Any source of samples; the weights of a `MixedDataset` are multiplied in.
+        table: Attribute -> value -> factor, for example ``{"timeofday": {"night": 2.0}, "source": {"dull": 0.5}}``.
+            Values not listed count 1, and the factors of several attributes multiply. 0 leaves a sample out.
+
+    Returns:
+        (N,) float64, relative weights.
+
+    Raises:
+        DataError: If a factor is negative, or all weights are 0.
+    """
+    weights = dataset.weights if isinstance(dataset, MixedDataset) else np.ones(len(dataset), np.float64)
+    for attribute, factors in table.items():
+        for value, factor in factors.items():
+            if not factor >= 0:
+                raise DataError(f"sampling weight of {attribute}={value} must not be negative, got {factor}")
+    if table:
+        for index in range(len(dataset)):
+            attributes = dataset.attributes(index)
+            for attribute, factors in table.items():
+                weights[index] *= factors.get(attributes.get(attribute, ""), 1.0)
+    if not weights.any():
+        raise DataError("every sampling weight is 0")
+    return weights
+
+
+def _image_files(root: Path, split: str) -> dict[str, str]:
+    """Return image name -> file name of a split."""
+    folder = root / IMAGE_FOLDER / split
+    if not folder.is_dir():
+        raise DataError(f"{root}: no folder {IMAGE_FOLDER}/{split}; expected the published layout, see docs/data.md")
+    files = {path.stem: path.name for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS}
+    if not files:
+        raise DataError(f"{folder}: no images ({', '.join(IMAGE_ENDINGS)})")
+    return files
+
+
+def _index_attributes(root: Path, split: str) -> dict[str, dict[str, str]]:
+    """Return image name -> the further columns of ``index.csv``, if there is one."""
+    path = root / "index.csv"
+    if not path.is_file():
+        return {}
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        columns = set(reader.fieldnames or ())
+        if not {"name", "split"} <= columns:
+            raise DataError(f"{path}: needs the columns 'name' and 'split'")
+        extra = sorted(columns - {"name", "split"})
+        return {
+            row["name"]: {column: row[column] or "" for column in extra} for row in reader if row["split"] == split
+        }
+
+
+@functools.lru_cache(maxsize=64)
+def _ego_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return where an image of ``size`` is valid, from a mask of the own car of any size."""
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise DataError(f"{path}: the ego mask that dataset.yaml names cannot be read") from error
+    own, _ = decode_mask(data, str(path), MaskMeaning(above=0))
+    if own.shape != size:
+        own = cv2.resize(own, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
+    valid: NDArray[np.bool_] = own == 0
+    valid.setflags(write=False)
+    return valid

@@ -1,0 +1,72 @@
+"""One labelled image, as read or as transformed: the noun of the data layer."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.errors import ShapeError
+
+__all__ = ["Sample"]
+
+
+def _no_boxes() -> NDArray[np.float32]:
+    return np.zeros((0, 4), np.float32)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sample:
+    """One image with whatever labels it has. A task without a label is None, never an empty mask or list.
+
+    Attributes:
+        name: The image's name without folder and ending; unique in its split.
+        image: (H, W, 3) uint8 RGB.
+        boxes: (N, 4) float32: left, top, right, bottom in pixels of ``image``; None = not labelled.
+        class_id: (N,) int64: index into the data set's class names; None exactly when ``boxes`` is.
+        ignored: (M, 4) float32 as ``boxes``: regions that are neither object nor background.
+        drivable: (H, W) uint8, 1 = drivable, 0 = not; None = not labelled.
+        lane: (H, W) uint8, 1 = lane marking, 0 = not; None = not labelled.
+        valid: (H, W) bool, False where every task is ignored (the own car's bonnet); None = valid everywhere.
+        attributes: Weather, scene, time of day, source and the like.
+
+    Raises:
+        ShapeError: If the arrays do not fit each other.
+    """
+
+    name: str
+    image: NDArray[np.uint8]
+    boxes: NDArray[np.float32] | None = None
+    class_id: NDArray[np.int64] | None = None
+    ignored: NDArray[np.float32] = dataclasses.field(default_factory=_no_boxes)
+    drivable: NDArray[np.uint8] | None = None
+    lane: NDArray[np.uint8] | None = None
+    valid: NDArray[np.bool_] | None = None
+    attributes: dict[str, str] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.dtype != np.uint8:
+            raise ShapeError(f"{self.name}: image must be (H, W, 3) uint8, got {self.image.shape} {self.image.dtype}")
+        if (self.boxes is None) != (self.class_id is None):
+            raise ShapeError(f"{self.name}: boxes and class_id go together")
+        if self.boxes is not None and self.class_id is not None:
+            count = len(self.boxes)
+            if self.boxes.shape != (count, 4) or self.class_id.shape != (count,):
+                raise ShapeError(
+                    f"{self.name}: boxes must be (N, 4) with N class ids, "
+                    f"got {self.boxes.shape} and {self.class_id.shape}"
+                )
+        if self.ignored.ndim != 2 or self.ignored.shape[1] != 4:
+            raise ShapeError(f"{self.name}: ignored must be (M, 4), got {self.ignored.shape}")
+        for field, dtype in (("drivable", np.uint8), ("lane", np.uint8), ("valid", np.bool_)):
+            mask = getattr(self, field)
+            if mask is not None and (mask.shape != self.size or mask.dtype != dtype):
+                raise ShapeError(
+                    f"{self.name}: {field} must be {self.size} {np.dtype(dtype)}, got {mask.shape} {mask.dtype}"
+                )
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the image in pixels."""
+        return self.image.shape[0], self.image.shape[1]

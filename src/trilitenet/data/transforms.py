@@ -1,0 +1,391 @@
+"""Transforms of a sample: one draw of random numbers for the image, its boxes and its masks.
+
+The published recipe (letterbox, one affine map, HSV gains, left-right flip) is `TrainTransform` with its defaults.
+Every geometric step is one 2x3 matrix from source pixels to canvas pixels, applied to all of them alike; pixel centres
+are at integer coordinates in the matrix and boxes are measured from the corner of the first pixel, so a box's edges
+are moved by half a pixel before and after.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.config import MAX_STRIDE
+from trilitenet.data.sample import Sample
+from trilitenet.errors import ConfigError
+from trilitenet.processing.letterbox import PAD_VALUE, Letterbox
+
+__all__ = [
+    "Affine",
+    "Augmentation",
+    "EvalTransform",
+    "TrainTransform",
+    "Transform",
+    "draw_affine",
+    "flip",
+    "hsv",
+    "kept_boxes",
+    "shift_hsv",
+    "warp",
+]
+
+class Transform(Protocol):
+    """A map from a sample to one at canvas size; all its randomness comes from ``rng``."""
+
+    def __call__(
+        self, sample: Sample, rng: np.random.Generator, draw: Callable[[np.random.Generator], Sample] | None = None
+    ) -> Sample:
+        """Return the transformed sample; ``draw`` gives another, untransformed one, for steps that join several."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Augmentation:
+    """Strengths of the random steps. The defaults are the published recipe.
+
+    Attributes:
+        rotation: Degrees, drawn in +-.
+        scale: Factor drawn in 1 +-.
+        translation: Fraction of the canvas, drawn in +- about its middle.
+        hue: Gain drawn in 1 +-.
+        saturation: Gain drawn in 1 +-.
+        value: Gain drawn in 1 +-.
+        flip: Probability of a left-right flip.
+        mask_above: A warped mask pixel (0 to 255) above this is foreground. The published 1 thickens masks by up to a
+            pixel; 127 keeps their area.
+    """
+
+    rotation: float = 10.0
+    scale: float = 0.25
+    translation: float = 0.1
+    hue: float = 0.015
+    saturation: float = 0.7
+    value: float = 0.4
+    flip: float = 0.5
+    mask_above: int = 1
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.scale < 1:
+            raise ConfigError(f"scale must be in [0, 1), got {self.scale}")
+        if not 0 <= self.mask_above < 255:
+            raise ConfigError(f"mask_above must be in [0, 255), got {self.mask_above}")
+        for name in ("rotation", "translation", "hue", "saturation", "value"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
+        for name in ("flip",):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"{name} is a probability, in [0, 1], got {getattr(self, name)}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Affine:
+    """One draw of the geometric step.
+
+    Attributes:
+        angle: Degrees, counter-clockwise as seen.
+        scale: Factor about the canvas centre.
+        shift: (x, y) in fractions of the canvas.
+        flip: Mirror left and right, last.
+    """
+
+    angle: float = 0.0
+    scale: float = 1.0
+    shift: tuple[float, float] = (0.0, 0.0)
+    flip: bool = False
+
+    def matrix(self, box: Letterbox) -> NDArray[np.float64]:
+        """Return the 2x3 map from pixels of the resized image (before padding) to canvas pixels."""
+        height, width = box.canvas
+        centre = ((width - 1) / 2, (height - 1) / 2)
+        about = np.eye(3)
+        about[:2] = cv2.getRotationMatrix2D(centre, self.angle, self.scale)
+        about[0, 2] += self.shift[0] * width
+        about[1, 2] += self.shift[1] * height
+        pad = np.array([[1.0, 0.0, box.left], [0.0, 1.0, box.top], [0.0, 0.0, 1.0]])
+        whole = about @ pad
+        if self.flip:
+            whole = np.array([[-1.0, 0.0, width - 1], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ whole
+        return np.ascontiguousarray(whole[:2])
+
+
+def draw_affine(rng: np.random.Generator, strength: Augmentation) -> Affine:
+    """Draw the geometric step (always the same count of random numbers)."""
+    angle, scale, x, y, mirrored = rng.random(5)
+    return Affine(
+        angle=(2 * angle - 1) * strength.rotation,
+        scale=1 + (2 * scale - 1) * strength.scale,
+        shift=((2 * x - 1) * strength.translation, (2 * y - 1) * strength.translation),
+        flip=bool(mirrored < strength.flip),
+    )
+
+
+def warp(sample: Sample, affine: Affine, canvas: tuple[int, int], mask_above: int = 1) -> Sample:
+    """Letterbox a sample and apply an affine map, in one interpolation after the resize.
+
+    Args:
+        sample: Of any size.
+        affine: The map on the letterboxed canvas.
+        canvas: (height, width) of the result in pixels.
+        mask_above: A warped mask pixel (0 to 255) above this is foreground.
+
+    Returns:
+        The sample at canvas size; boxes of which too little is left are gone (`kept_boxes`).
+    """
+    box = Letterbox.fit(sample.size, canvas=canvas)
+    matrix = affine.matrix(box)
+    masks = {
+        "drivable": sample.drivable,
+        "lane": sample.lane,
+        # What comes from outside the image is not the own car: its mask is warped, and padded with 0.
+        "valid": None if sample.valid is None else (~sample.valid).view(np.uint8),
+    }
+    image, moved = _warp_together(
+        _resize(sample.image, box),
+        {name: _resize_mask(mask, box, mask_above) for name, mask in masks.items() if mask is not None},
+        matrix,
+        canvas,
+    )
+    boxes, class_id = sample.boxes, sample.class_id
+    if boxes is not None and class_id is not None:
+        boxes, keep = _move_boxes(boxes, box, matrix, affine.scale, strict=True)
+        class_id = class_id[keep]
+    ignored, _ = _move_boxes(sample.ignored, box, matrix, affine.scale, strict=False)
+    return dataclasses.replace(
+        sample,
+        image=image,
+        boxes=boxes,
+        class_id=class_id,
+        ignored=ignored,
+        drivable=_binary(moved.get("drivable"), mask_above),
+        lane=_binary(moved.get("lane"), mask_above),
+        valid=None if sample.valid is None else moved["valid"] <= 1,
+    )
+
+
+def flip(sample: Sample) -> Sample:
+    """Mirror a sample left and right."""
+    width = sample.image.shape[1]
+    return dataclasses.replace(
+        sample,
+        image=np.ascontiguousarray(sample.image[:, ::-1]),
+        boxes=None if sample.boxes is None else _mirror(sample.boxes, width),
+        ignored=_mirror(sample.ignored, width),
+        drivable=None if sample.drivable is None else np.ascontiguousarray(sample.drivable[:, ::-1]),
+        lane=None if sample.lane is None else np.ascontiguousarray(sample.lane[:, ::-1]),
+        valid=None if sample.valid is None else np.ascontiguousarray(sample.valid[:, ::-1]),
+    )
+
+
+def hsv(image: NDArray[np.uint8], rng: np.random.Generator, strength: Augmentation) -> NDArray[np.uint8]:
+    """Multiply hue, saturation and value of an RGB image by random gains (always three random numbers)."""
+    gains = 1 + (2 * rng.random(3) - 1) * (strength.hue, strength.saturation, strength.value)
+    if not (strength.hue or strength.saturation or strength.value):
+        return image
+    return shift_hsv(image, (float(gains[0]), float(gains[1]), float(gains[2])))
+
+
+def shift_hsv(image: NDArray[np.uint8], gains: tuple[float, float, float]) -> NDArray[np.uint8]:
+    """Multiply hue, saturation and value of an image by gains.
+
+    Args:
+        image: (H, W, 3) uint8 **RGB** (the published code runs this step with red and blue swapped).
+        gains: Of hue (wraps round), saturation and value (both clipped).
+
+    Returns:
+        (H, W, 3) uint8 RGB, a new array.
+    """
+    levels = np.arange(256, dtype=np.float64)
+    table = np.empty((1, 256, 3), np.uint8)
+    table[0, :, 0] = (levels * gains[0]) % 180
+    table[0, :, 1] = np.clip(levels * gains[1], 0, 255)
+    table[0, :, 2] = np.clip(levels * gains[2], 0, 255)
+    converted = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)
+    cv2.LUT(converted, table, dst=converted)
+    return cv2.cvtColor(converted, cv2.COLOR_HSV2RGB, dst=converted)  # type: ignore[no-any-return]
+
+
+def kept_boxes(moved: NDArray[np.float32], clipped: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return which boxes to keep after clipping, by the published rule.
+
+    A box goes when what is left of it is under 2 px wide or high, under 10% of its area, or thinner than 20:1.
+
+    Args:
+        moved: (N, 4) xyxy px: the boxes at their new size, not clipped.
+        clipped: (N, 4) xyxy px: the same clipped to the canvas.
+
+    Returns:
+        (N,) bool.
+    """
+    before = np.maximum(moved[:, 2:] - moved[:, :2], 0)
+    after = np.maximum(clipped[:, 2:] - clipped[:, :2], 0)
+    ratio = np.maximum(after[:, 0], after[:, 1]) / np.maximum(np.minimum(after[:, 0], after[:, 1]), 1e-9)
+    enough = after.prod(axis=1) > 0.1 * before.prod(axis=1)
+    kept: NDArray[np.bool_] = (after > 2).all(axis=1) & enough & (ratio < 20)
+    return kept
+
+
+@dataclasses.dataclass(frozen=True)
+class EvalTransform:
+    """Letterbox alone.
+
+    Attributes:
+        canvas: (height, width) of the result in pixels, multiples of 32.
+    """
+
+    canvas: tuple[int, int] = (384, 640)
+
+    def __post_init__(self) -> None:
+        _check_canvas(self.canvas)
+
+    def __call__(
+        self,
+        sample: Sample,
+        rng: np.random.Generator | None = None,
+        draw: Callable[[np.random.Generator], Sample] | None = None,
+    ) -> Sample:
+        """Return the sample at canvas size; all boxes are kept."""
+        box = Letterbox.fit(sample.size, canvas=self.canvas)
+        valid = sample.valid
+        if valid is not None:
+            # What is outside the image is not the own car, so the padding stays valid.
+            valid = box.mask((~valid).astype(np.uint8) * 255) == 0
+        return dataclasses.replace(
+            sample,
+            image=box.image(sample.image),
+            boxes=None if sample.boxes is None else box.boxes(sample.boxes).astype(np.float32),
+            ignored=box.boxes(sample.ignored).astype(np.float32),
+            drivable=_letterbox_mask(sample.drivable, box),
+            lane=_letterbox_mask(sample.lane, box),
+            valid=valid,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainTransform:
+    """The published augmentation: letterbox, one affine map, HSV gains, flip.
+
+    Attributes:
+        canvas: (height, width) of the result in pixels, multiples of 32.
+        strength: How strong each random step is.
+    """
+
+    canvas: tuple[int, int] = (384, 640)
+    strength: Augmentation = Augmentation()
+
+    def __post_init__(self) -> None:
+        _check_canvas(self.canvas)
+
+    def __call__(
+        self, sample: Sample, rng: np.random.Generator, draw: Callable[[np.random.Generator], Sample] | None = None
+    ) -> Sample:
+        """Return an augmented sample at canvas size."""
+        moved = warp(sample, draw_affine(rng, self.strength), self.canvas, self.strength.mask_above)
+        return dataclasses.replace(moved, image=hsv(moved.image, rng, self.strength))
+
+
+def _check_canvas(canvas: tuple[int, int]) -> None:
+    if min(canvas) < MAX_STRIDE or canvas[0] % MAX_STRIDE or canvas[1] % MAX_STRIDE:
+        raise ConfigError(f"canvas must be multiples of {MAX_STRIDE}, got {canvas[0]}x{canvas[1]} (height x width)")
+
+
+def _resize(array: NDArray[np.uint8], box: Letterbox) -> NDArray[np.uint8]:
+    """Resize an image or mask to the letterbox's size, without padding."""
+    height, width = box.resized
+    if array.shape[:2] == (height, width):
+        return array
+    shrinking = height * width < array.shape[0] * array.shape[1]
+    return cv2.resize(  # type: ignore[no-any-return]
+        array, (width, height), interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR
+    )
+
+
+def _resize_mask(mask: NDArray[np.uint8], box: Letterbox, above: int) -> NDArray[np.uint8]:
+    """Return a {0, 1} mask as {0, 255} at the letterbox's size, without padding."""
+    grey = _resize(mask * np.uint8(255), box)
+    return grey if grey.shape == mask.shape else cv2.threshold(grey, above, 255, cv2.THRESH_BINARY)[1]
+
+
+def _warp_together(
+    image: NDArray[np.uint8],
+    masks: dict[str, NDArray[np.uint8]],
+    matrix: NDArray[np.float64],
+    canvas: tuple[int, int],
+) -> tuple[NDArray[np.uint8], dict[str, NDArray[np.uint8]]]:
+    """Warp an image, padded with grey, and its masks, padded with 0.
+
+    One mask travels as the image's fourth channel: OpenCV warps four channels in less than half the time of three.
+    """
+    names = list(masks)
+    rider = masks[names[0]] if names else np.zeros(image.shape[:2], np.uint8)
+    whole = cv2.warpAffine(
+        cv2.merge([image, rider]),
+        matrix,
+        (canvas[1], canvas[0]),
+        flags=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=(PAD_VALUE, PAD_VALUE, PAD_VALUE, 0),
+    )
+    moved = {
+        name: cv2.warpAffine(masks[name], matrix, (canvas[1], canvas[0]), flags=cv2.INTER_LINEAR) for name in names[1:]
+    }
+    if names:
+        moved[names[0]] = cv2.extractChannel(whole, 3)
+    return cv2.cvtColor(whole, cv2.COLOR_RGBA2RGB), moved
+
+
+def _binary(grey: NDArray[np.uint8] | None, above: int) -> NDArray[np.uint8] | None:
+    return None if grey is None else cv2.threshold(grey, above, 1, cv2.THRESH_BINARY)[1]
+
+
+def _letterbox_mask(mask: NDArray[np.uint8] | None, box: Letterbox) -> NDArray[np.uint8] | None:
+    if mask is None:
+        return None
+    return (box.mask(mask * np.uint8(255)) > 0).view(np.uint8)
+
+
+def _move_boxes(
+    boxes: NDArray[np.float32], box: Letterbox, matrix: NDArray[np.float64], scale: float, *, strict: bool
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Move boxes of the source image by ``matrix``: the hull of the four corners, clipped to the canvas.
+
+    Args:
+        boxes: (N, 4) xyxy px of the source image.
+        box: How the source image was resized.
+        matrix: From resized pixels to canvas pixels.
+        scale: The scale in ``matrix``.
+        strict: Drop by `kept_boxes`; else drop what is wholly outside.
+
+    Returns:
+        (K, 4) float32 xyxy canvas px, and (N,) bool: which were kept.
+    """
+    if not len(boxes):
+        return boxes, np.zeros(0, np.bool_)
+    factor = np.array([box.resized[1] / box.source[1], box.resized[0] / box.source[0]] * 2)
+    resized = boxes * factor
+    # Edges lie half a pixel outside the centres of the outermost pixels.
+    corners = np.stack(
+        [resized[:, [0, 1]], resized[:, [2, 1]], resized[:, [2, 3]], resized[:, [0, 3]]], axis=1
+    ) - 0.5
+    moved = corners @ matrix[:, :2].T + matrix[:, 2] + 0.5
+    hull = np.concatenate([moved.min(axis=1), moved.max(axis=1)], axis=1).astype(np.float32)
+    clipped: NDArray[np.float32] = hull.copy()
+    np.clip(clipped[:, 0::2], 0, box.canvas[1], out=clipped[:, 0::2])
+    np.clip(clipped[:, 1::2], 0, box.canvas[0], out=clipped[:, 1::2])
+    if strict:
+        # The published rule compares with the scaled box, not with the hull of the rotated one.
+        keep = kept_boxes((resized * scale).astype(np.float32), clipped)
+    else:
+        keep = (clipped[:, 2] > clipped[:, 0]) & (clipped[:, 3] > clipped[:, 1])
+    return clipped[keep], keep
+
+
+def _mirror(boxes: NDArray[np.float32], width: int) -> NDArray[np.float32]:
+    mirrored = boxes.copy()
+    mirrored[:, 0] = width - boxes[:, 2]
+    mirrored[:, 2] = width - boxes[:, 0]
+    return mirrored
