@@ -1,0 +1,183 @@
+"""The command line, generated from the typed, documented functions in `trilitenet.commands`.
+
+A command is one line of `COMMANDS`. Its flags are the function's parameters and its help is the docstring, so the
+Python API and the command line agree by construction. The function's module is imported only when its command is
+called: ``trilitenet --help`` reads the summaries from the sources and loads neither PyTorch nor any other runtime.
+
+What a command returns is shown by its ``summary()`` (or as it is, if it is text), and ends with ``exit_code`` where it
+has one. Exit codes: 0 done; 1 an error, told in one line; 2 a wrong command line; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import logging
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import cyclopts
+from cyclopts.exceptions import CycloptsError, UnknownOptionError, UnusedCliTokensError
+
+import trilitenet
+from trilitenet.errors import TriLiteNetError, did_you_mean
+
+__all__ = ["COMMANDS", "GROUPS", "Command", "build_app", "main"]
+
+
+class Command(NamedTuple):
+    """One command.
+
+    Attributes:
+        words: What the user types after ``trilitenet``.
+        module: The module in `trilitenet.commands` that has the function.
+        function: The function's name.
+    """
+
+    words: str
+    module: str
+    function: str
+
+    def load(self) -> Callable[..., Any]:
+        """Import the function."""
+        function: Callable[..., Any] = getattr(
+            importlib.import_module(f"trilitenet.commands.{self.module}"), self.function
+        )
+        return function
+
+    def read_summary(self) -> str:
+        """Return the first line of the function's docstring, read from its source without importing it."""
+        source = Path(trilitenet.__file__).parent / "commands" / f"{self.module}.py"
+        for node in ast.parse(source.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.FunctionDef) and node.name == self.function:
+                return (ast.get_docstring(node) or "").partition("\n")[0]
+        raise LookupError(f"{source} has no function {self.function}")
+
+
+COMMANDS: Final[tuple[Command, ...]] = (
+    Command("weights import", "weights", "import_weights"),
+    Command("weights info", "weights", "info"),
+)
+
+GROUPS: Final = {
+    "data": "Make, read, check and convert data sets.",
+    "weights": "Import, inspect and average weights.",
+}
+"""Words that gather commands, with their help."""
+
+_ROOT_OPTIONS: Final = ("--help", "-h", "--version")
+
+
+def build_app(words: Sequence[str] = (), *, everything: bool = False) -> cyclopts.App:
+    """Build the command line.
+
+    Args:
+        words: What the user typed: only the command that they name is imported.
+        everything: Import every command, as a generator of documentation needs.
+    """
+    app = cyclopts.App(
+        name="trilitenet",
+        help="Light driving perception: vehicles, drivable area and lane lines from one tiny network.",
+        version=f"trilitenet {trilitenet.__version__}",
+        help_format="markdown",
+        help_on_error=False,
+        suppress_keyboard_interrupt=False,
+    )
+    groups = {name: cyclopts.App(name=name, help=text) for name, text in GROUPS.items()}
+    for command in COMMANDS:
+        parts = command.words.split()
+        parent = groups[parts[0]] if len(parts) == 2 else app
+        if everything or list(words[: len(parts)]) == parts:
+            parent.command(command.load(), name=parts[-1])
+        elif not words or words[0].startswith("-") or list(words[: len(parts) - 1]) == parts[:-1]:
+            parent.command(_placeholder, name=parts[-1], help=command.read_summary())
+    for group in groups.values():
+        if any(not name.startswith("-") for name in group):
+            app.command(group)
+    return app
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        words: The arguments; those of the process if left out.
+
+    Returns:
+        The exit code.
+    """
+    words = list(sys.argv[1:] if words is None else words)
+    logging.basicConfig(
+        level=os.environ.get("TRILITENET_LOG", "WARNING").upper(),
+        format="%(levelname)s %(name)s: %(message)s",
+    )
+    try:
+        _check_command(words)
+        app = build_app(words)
+        result = app(words, print_error=False, exit_on_error=False, verbose=False, result_action="return_value")
+        sys.stdout.write(_shown(result))
+        sys.stdout.flush()
+    except _MisuseError as error:
+        return _fail(str(error), code=2)
+    except CycloptsError as error:
+        return _fail(_one_line(error), code=2)
+    except TriLiteNetError as error:
+        return _fail(str(error), code=1)
+    except KeyboardInterrupt:
+        return _fail("interrupted", code=130)
+    except BrokenPipeError:  # the reader, such as `head`, has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    return int(getattr(result, "exit_code", 0))
+
+
+class _MisuseError(Exception):
+    """A first word that is no command and no option."""
+
+
+def _placeholder() -> None:
+    """Stand in for a command that the command line does not name."""
+
+
+def _check_command(words: Sequence[str]) -> None:
+    """Refuse a word that is no command, naming the nearest one, without importing any."""
+    paths = [command.words.split() for command in COMMANDS]
+    if not words:
+        return
+    if words[0].startswith("-"):
+        if words[0] not in _ROOT_OPTIONS:
+            raise _MisuseError(f"unknown option {words[0]}{did_you_mean(words[0], _ROOT_OPTIONS)}")
+        return
+    known = {path[0] for path in paths}
+    if words[0] not in known:
+        raise _MisuseError(f"unknown command {words[0]!r}{did_you_mean(words[0], known)}")
+    below = {path[1] for path in paths if path[0] == words[0] and len(path) == 2}
+    if below and len(words) > 1 and not words[1].startswith("-") and words[1] not in below:
+        raise _MisuseError(f"unknown command '{words[0]} {words[1]}'{did_you_mean(words[1], below)}")
+
+
+def _one_line(error: CycloptsError) -> str:
+    """Return the message as one line, and how to get help."""
+    if isinstance(error, UnknownOptionError) and error.token.keyword:
+        known = [name for argument in error.argument_collection if argument.parse for name in argument.names]
+        near = did_you_mean(error.token.keyword, known)
+        text = f"unknown option {error.token.keyword}" + (near if near.endswith("?") else "")
+    elif isinstance(error, UnusedCliTokensError):
+        text = f"unexpected {' '.join(error.unused_tokens or ())}"
+    else:
+        text = " ".join(str(error).split())
+    chain = " ".join(["trilitenet", *(error.command_chain or ())])
+    return f"{text.rstrip('.')} (see: {chain} --help)"
+
+
+def _shown(result: object) -> str:
+    text = result.summary() if hasattr(result, "summary") else result
+    return f"{text}\n" if isinstance(text, str) and text else ""
+
+
+def _fail(message: str, code: int) -> int:
+    sys.stderr.write(f"error: {message}\n")
+    return code

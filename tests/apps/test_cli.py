@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+
+import pytest
+
+from trilitenet.apps import cli
+from trilitenet.errors import OutputError
+
+
+@pytest.fixture
+def greet(monkeypatch: pytest.MonkeyPatch) -> list[object]:
+    """Put a single command `greet` in place of the real ones; the list takes what it was called with."""
+    calls: list[object] = []
+
+    class Done:
+        exit_code = 1
+
+        def summary(self) -> str:
+            return "1 of 2 greeted"
+
+    def greeting(name: str, *, loudness: int = 1) -> object:
+        """Greet somebody.
+
+        Args:
+            name: Whom.
+            loudness: How loud.
+        """
+        calls.append((name, loudness))
+        if name == "nobody":
+            raise OutputError("nobody: cannot be greeted")
+        if name == "ctrl-c":
+            raise KeyboardInterrupt
+        return Done() if name == "two" else f"hello {name}"
+
+    monkeypatch.setattr(cli, "COMMANDS", (cli.Command("greet", "greet", "greeting"),))
+    monkeypatch.setattr(cli.Command, "load", lambda self: greeting)
+    monkeypatch.setattr(cli.Command, "read_summary", lambda self: "Greet somebody.")
+    return calls
+
+
+def test_a_command_is_its_function(greet: list[object], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["greet", "Ada", "--loudness", "3"]) == 0
+    assert greet == [("Ada", 3)]
+    assert capsys.readouterr().out == "hello Ada\n"
+
+
+def test_a_result_is_shown_and_decides_the_exit_code(greet: list[object], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["greet", "two"]) == 1
+    assert capsys.readouterr().out == "1 of 2 greeted\n"
+
+
+def test_an_error_is_one_line(greet: list[object], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["greet", "nobody"]) == 1
+    captured = capsys.readouterr()
+    assert captured.err == "error: nobody: cannot be greeted\n"
+    assert captured.out == ""
+
+
+def test_an_interruption_is_130(greet: list[object]) -> None:
+    assert cli.main(["greet", "ctrl-c"]) == 130
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["gret"], "error: unknown command 'gret'; did you mean 'greet'?\n"),
+        (["--versoin"], "error: unknown option --versoin; did you mean '--version'?\n"),
+        (
+            ["greet", "Ada", "--loudnes", "3"],
+            "error: unknown option --loudnes; did you mean '--loudness'? (see: trilitenet greet --help)\n",
+        ),
+        (["greet"], 'error: Command "greet" parameter --name requires an argument (see: trilitenet greet --help)\n'),
+        (["greet", "a", "1", "2"], None),
+        (["greet", "a", "--loudness", "much"], None),
+    ],
+)
+def test_misuse_is_one_line_and_exit_code_2(
+    greet: list[object], words: list[str], message: str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert message is None or error == message
+
+
+def test_help_and_version(greet: list[object], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["greet", "--help"]) == 0
+    assert "How loud." in capsys.readouterr().out
+    for words in ([], ["--help"]):
+        assert cli.main(words) == 0
+        assert "Greet somebody." in capsys.readouterr().out
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("trilitenet 0.")
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS, ids=lambda command: command.words)
+def test_every_command_is_documented(command: cli.Command) -> None:
+    function = command.load()
+    documentation = inspect.getdoc(function) or ""
+    assert command.read_summary() == documentation.partition("\n")[0] != ""
+    for name in inspect.signature(function).parameters:
+        assert f"    {name}: " in documentation, f"{command.words}: {name} is not documented"
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS, ids=lambda command: command.words)
+def test_every_command_has_help(command: cli.Command, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*command.words.split(), "--help"]) == 0
+    assert f"trilitenet {command.words}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [["--help"], ["--version"], ["weights", "--help"], ["wieghts"]])
+def test_help_loads_no_runtime(words: list[str]) -> None:
+    script = (
+        "import sys; from trilitenet.apps.cli import main; main(sys.argv[1:]);"
+        "assert not {'torch', 'av', 'cv2', 'openvino', 'onnxruntime'} & set(sys.modules), sorted(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", script, *words], check=True, timeout=60, capture_output=True)
+
+
+def test_python_m_is_the_command() -> None:
+    done = subprocess.run([sys.executable, "-m", "trilitenet", "--version"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0
+    assert done.stdout.startswith("trilitenet ")
