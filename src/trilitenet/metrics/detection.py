@@ -1,0 +1,524 @@
+"""Detection by COCO matching ('fair' protocol): average precision, and precision, recall and F1 at a confidence.
+
+Per image and class the boxes, best first and at most ``max_boxes``, each take the free true box of highest IoU not
+below the threshold. A box that can only take an ignored region (its intersection over the *box's* area reaches the
+threshold), or a true box outside the area range, counts neither way; an ignored region can take any number of boxes.
+
+    AP        = mean over recall 0, 0.01, ..., 1 of the highest precision at that recall or above
+    AP50:95   = mean of AP over IoU thresholds 0.50, 0.55, ..., 0.95
+    F1        = 2 precision recall / (precision + recall), at IoU 0.5
+
+This is what pycocotools computes (Lin et al., ECCV 2014, with ``iscrowd`` for ignored regions); the two are compared
+in the tests. Here an image leaves a few bytes a box instead of a dictionary, and images can be weighted, which is how
+intervals and the tables by condition are made.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.errors import ShapeError
+from trilitenet.metrics.rows import Rows
+from trilitenet.metrics.segmentation import ratio
+
+__all__ = ["AREAS", "IOU_THRESHOLDS", "DetectionCurve", "DetectionMetric", "DetectionScores", "OperatingPoint"]
+
+FloatArray = NDArray[np.float64]
+
+IOU_THRESHOLDS: Final = tuple(round(0.5 + 0.05 * step, 2) for step in range(10))
+"""IoU a box must reach, for AP50:95."""
+AREAS: Final[dict[str, tuple[float, float]]] = {
+    "all": (0.0, 1e10),
+    "small": (0.0, 32.0**2),
+    "medium": (32.0**2, 96.0**2),
+    "large": (96.0**2, 1e10),
+}
+"""Box areas, in square pixels of the image as stored, both ends included (COCO's)."""
+_RECALLS: Final[FloatArray] = np.linspace(0.0, 1.0, 101)
+_EPS: Final = float(np.spacing(1))
+
+
+@dataclasses.dataclass(frozen=True)
+class OperatingPoint:
+    """Detection at one confidence threshold and IoU 0.5, all classes together.
+
+    Attributes:
+        confidence: Boxes above this count (at or above, for the best F1).
+        precision: Share of boxes that are right.
+        recall: Share of true boxes found.
+        f1: Harmonic mean of the two.
+    """
+
+    confidence: float
+    precision: float
+    recall: float
+    f1: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class DetectionCurve:
+    """Precision and recall at IoU 0.5, all classes together, along falling confidence.
+
+    Attributes:
+        confidence: (K,) distinct confidences, falling.
+        precision: (K,)
+        recall: (K,)
+    """
+
+    confidence: FloatArray
+    precision: FloatArray
+    recall: FloatArray
+
+
+@dataclasses.dataclass(frozen=True)
+class DetectionScores:
+    """Detection scores over a data set; ratios in [0, 1], NaN where undefined (no true box).
+
+    Attributes:
+        images: Labelled images with a true box or a predicted one.
+        both_empty: Labelled images with neither.
+        not_labelled: Images without truth.
+        objects: True boxes (ignored regions apart).
+        boxes: Predicted boxes, ignored ones left out.
+        ap50: AP at IoU 0.5, mean over classes.
+        ap75: AP at IoU 0.75.
+        ap: AP50:95.
+        ap_small: AP50:95 of boxes up to 32 x 32 pixels.
+        ap_medium: AP50:95 of boxes between.
+        ap_large: AP50:95 of boxes from 96 x 96 pixels.
+        ap50_by_class: Class name -> AP50.
+        best: Where F1 is best.
+        at: At the stated confidence.
+        recall_all: Recall at IoU 0.5 of all boxes, whatever their confidence.
+    """
+
+    images: int
+    both_empty: int
+    not_labelled: int
+    objects: int
+    boxes: int
+    ap50: float
+    ap75: float
+    ap: float
+    ap_small: float
+    ap_medium: float
+    ap_large: float
+    ap50_by_class: dict[str, float]
+    best: OperatingPoint
+    at: OperatingPoint
+    recall_all: float
+
+
+class DetectionMetric:
+    """Detection scores, an image at a time; about 30 bytes a box and 50 an image are kept.
+
+    Args:
+        class_names: Names that class ids index.
+        confidence: The stated confidence of `DetectionScores.at` and of the confusion matrix.
+        max_boxes: At most so many boxes an image and class count (COCO itself uses 100).
+    """
+
+    def __init__(
+        self, class_names: Sequence[str] = ("vehicle",), confidence: float = 0.25, max_boxes: int = 300
+    ) -> None:
+        self.class_names = tuple(class_names)
+        self.confidence = confidence
+        self.max_boxes = max_boxes
+        self._thresholds = np.array(IOU_THRESHOLDS, np.float64)
+        self._ranges = np.array(list(AREAS.values()), np.float64)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        areas, classes = len(AREAS), len(self.class_names)
+        self._scores = Rows(1, np.float32)
+        self._image = Rows(1, np.int32)
+        self._class = Rows(1, np.int16)
+        self._matched = Rows(areas, np.uint16)  # one bit an IoU threshold
+        self._ignored = Rows(areas, np.uint16)
+        self._objects = Rows(areas * classes, np.int32)
+        self._labelled = Rows(1, np.bool_)
+        self._confusion: NDArray[np.int64] = np.zeros((classes + 1, classes + 1), np.int64)
+
+    def __len__(self) -> int:
+        return len(self._labelled)
+
+    @property
+    def confusion(self) -> NDArray[np.int64]:
+        """(classes + 1, classes + 1) counts at the stated confidence and IoU 0.5: row truth, column prediction.
+
+        The last row is background that was taken for an object, the last column objects that were missed.
+        """
+        return self._confusion.copy()
+
+    def update(
+        self,
+        boxes: NDArray[Any] | None,
+        scores: NDArray[Any] | None,
+        class_id: NDArray[Any] | None,
+        truth: NDArray[Any] | None,
+        truth_class: NDArray[Any] | None,
+        ignored: NDArray[Any] | None = None,
+    ) -> tuple[int, int, int] | None:
+        """Add an image.
+
+        Args:
+            boxes: (D, 4) predicted left, top, right, bottom in pixels; None if the model gave none.
+            scores: (D,) confidences in [0, 1].
+            class_id: (D,) class ids.
+            truth: (G, 4) true boxes; None = not labelled.
+            truth_class: (G,) class ids.
+            ignored: (M, 4) ignored regions, of any class.
+
+        Returns:
+            Right boxes, wrong boxes and missed objects of the image at the stated confidence; None where the image
+            does not count.
+
+        Raises:
+            ShapeError: If scores, class ids and boxes differ in number.
+        """
+        index = len(self._labelled)
+        labelled = boxes is not None and truth is not None
+        self._labelled.append(labelled)
+        objects = np.zeros((len(self.class_names), len(AREAS)), np.int32)
+        if boxes is None or scores is None or class_id is None or truth is None or truth_class is None:
+            self._objects.append(objects.ravel())
+            return None
+        if not len(boxes) == len(scores) == len(class_id) or len(truth) != len(truth_class):
+            raise ShapeError("boxes, scores and class ids must be as many as each other")
+        regions = np.zeros((0, 4)) if ignored is None else np.asarray(ignored, np.float64).reshape(-1, 4)
+        order = np.argsort(-np.asarray(scores, np.float32), kind="stable")
+        for number in range(len(self.class_names)):
+            picked = order[np.asarray(class_id)[order] == number][: self.max_boxes]
+            true = np.asarray(truth, np.float64).reshape(-1, 4)[np.asarray(truth_class) == number]
+            objects[number] = self._in_range(_area(true)).sum(axis=1)
+            if not len(picked):
+                continue
+            matched, passed = self._match(np.asarray(boxes, np.float64)[picked], true, regions)
+            self._scores.append(np.asarray(scores, np.float32)[picked, None])
+            self._image.append(np.full((len(picked), 1), index))
+            self._class.append(np.full((len(picked), 1), number))
+            self._matched.append(matched)
+            self._ignored.append(passed)
+        self._objects.append(objects.ravel())
+        kept = order[np.asarray(scores)[order] > self.confidence]
+        return self._confuse(
+            np.asarray(boxes, np.float64)[kept], np.asarray(class_id)[kept], truth, truth_class, regions
+        )
+
+    def _in_range(self, area: FloatArray) -> NDArray[np.bool_]:
+        """Return (areas, N): whether each area lies in each range."""
+        return (area >= self._ranges[:, :1]) & (area <= self._ranges[:, 1:])
+
+    def _match(
+        self, boxes: FloatArray, truth: FloatArray, regions: FloatArray
+    ) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+        """Match sorted boxes of one class: (D, areas) bits an IoU threshold of right boxes and of ignored ones."""
+        limits = np.minimum(self._thresholds, 1 - 1e-10)
+        bits = (1 << np.arange(len(limits))).astype(np.uint16)
+        count, shape = len(boxes), (len(boxes), len(AREAS))
+        matched, passed = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
+        outside = ~self._in_range(_area(boxes))  # (areas, D)
+        overlap = _iou(boxes, truth)
+        cover = _cover(boxes, regions)
+        in_region = cover.max(axis=1)[:, None] >= limits if len(regions) else np.zeros((count, len(limits)), np.bool_)
+        # Boxes near no true box: wrong, unless in an ignored region or outside the area range.
+        passed[:] = np.where(
+            outside.T, np.uint16(bits.sum()), (in_region * bits).sum(axis=1).astype(np.uint16)[:, None]
+        )
+        if not len(truth):
+            return matched, passed
+        # The others, in falling order of confidence, for all area ranges and thresholds at once.
+        true_ignored = ~self._in_range(_area(truth))  # (areas, G)
+        free = np.ones((len(AREAS), len(limits), len(truth)), np.bool_)
+        best_cover = cover.max(axis=1) if len(regions) else np.full(count, -1.0)
+        for row in np.flatnonzero(overlap.max(axis=1) >= limits[0]):
+            reach = free & (overlap[row] >= limits[:, None])  # (areas, T, G)
+            good = reach & ~true_ignored[:, None, :]
+            hit = good.any(axis=2)
+            score = np.where(good, overlap[row], -1.0)
+            target = score.shape[2] - 1 - score[..., ::-1].argmax(axis=2)  # of equal ones the last, as in COCO
+            spare = reach & true_ignored[:, None, :]
+            spare_score = np.where(spare, overlap[row], -1.0)
+            spare_target = spare_score.shape[2] - 1 - spare_score[..., ::-1].argmax(axis=2)
+            spare_best = spare_score.max(axis=2)
+            in_spare = ~hit & spare.any(axis=2) & (spare_best > best_cover[row] * in_region[row])
+            area, level = np.nonzero(hit)
+            free[area, level, target[hit]] = False
+            area, level = np.nonzero(in_spare)
+            free[area, level, spare_target[in_spare]] = False
+            neutral = ~hit & (in_spare | in_region[row] | outside[:, row, None])
+            matched[row] = (hit * bits).sum(axis=1)
+            passed[row] = (neutral * bits).sum(axis=1)
+        return matched, passed
+
+    def _confuse(
+        self,
+        boxes: FloatArray,
+        class_id: NDArray[Any],
+        truth: NDArray[Any],
+        truth_class: NDArray[Any],
+        regions: FloatArray,
+    ) -> tuple[int, int, int]:
+        """Match sorted boxes to true ones of any class at IoU 0.5, into the confusion matrix."""
+        background = len(self.class_names)
+        overlap = _iou(boxes, np.asarray(truth, np.float64).reshape(-1, 4))
+        covered = (_cover(boxes, regions) >= 0.5).any(axis=1)
+        free = np.ones(len(truth), np.bool_)
+        right = wrong = 0
+        for row in range(len(boxes)):
+            reach = np.where(free, overlap[row], -1.0)
+            # A true box of the same class goes before one of another.
+            same = np.where(np.asarray(truth_class) == class_id[row], reach, -1.0)
+            pick = same if len(same) and same.max() >= 0.5 else reach
+            if len(pick) and pick.max() >= 0.5:
+                target = int(pick.argmax())
+                free[target] = False
+                true_class = int(truth_class[target])
+                self._confusion[true_class, int(class_id[row])] += 1
+                right, wrong = right + (true_class == class_id[row]), wrong + (true_class != class_id[row])
+            elif not covered[row]:
+                self._confusion[background, int(class_id[row])] += 1
+                wrong += 1
+        np.add.at(self._confusion, (np.asarray(truth_class, np.int64)[free], background), 1)
+        return int(right), int(wrong), len(truth) - int(right)
+
+    # Scores -------------------------------------------------------------------------------------------------------
+
+    def _sorted(self, number: int | None) -> NDArray[np.int64]:
+        """Return positions of the boxes of a class (None = all), best first, as COCO sorts them."""
+        scores = self._scores.array[:, 0]
+        picked = np.arange(len(scores)) if number is None else np.flatnonzero(self._class.array[:, 0] == number)
+        return picked[np.argsort(-scores[picked], kind="stable")]
+
+    def _objects_of(self, number: int, area: int, weights: NDArray[Any] | None) -> FloatArray:
+        column = self._objects.array[:, number * len(AREAS) + area].astype(np.float64)
+        return np.array([column.sum()]) if weights is None else np.asarray(weights, np.float64) @ column
+
+    def average_precision(
+        self, weights: NDArray[Any] | None = None, area: str = "all", levels: Sequence[int] | None = None
+    ) -> FloatArray:
+        """Return AP by class and IoU threshold.
+
+        Args:
+            weights: (R, N) how often each image counts; None for once each (R = 1).
+            area: A key of `AREAS`.
+            levels: Positions in `IOU_THRESHOLDS`; None for all.
+
+        Returns:
+            (R, classes, levels) in [0, 1], NaN for a class without true boxes.
+        """
+        chosen = range(len(IOU_THRESHOLDS)) if levels is None else levels
+        rounds = 1 if weights is None else len(weights)
+        out = np.full((rounds, len(self.class_names), len(chosen)), np.nan)
+        column = list(AREAS).index(area)
+        for number in range(len(self.class_names)):
+            order = self._sorted(number)
+            image = self._image.array[order, 0]
+            matched = self._matched.array[order, column]
+            counted = self._ignored.array[order, column]
+            objects = self._objects_of(number, column, weights)
+            for position, level in enumerate(chosen):
+                bit = np.uint16(1 << level)
+                use = (counted & bit) == 0
+                hit = (matched[use] & bit) != 0
+                images = image[use]
+                for index in range(rounds):
+                    if objects[index] > 0:
+                        weight = None if weights is None else weights[index][images]
+                        out[index, number, position] = _ap(hit, weight, float(objects[index]))
+        return out
+
+    def curve(self) -> DetectionCurve:
+        """Return precision and recall at IoU 0.5 along falling confidence, all classes together."""
+        order = self._sorted(None)
+        bit = np.uint16(1)
+        order = order[(self._ignored.array[order, 0] & bit) == 0]
+        hit = (self._matched.array[order, 0] & bit) != 0
+        scores = self._scores.array[order, 0].astype(np.float64)
+        right = np.cumsum(hit)
+        last = np.flatnonzero(np.append(scores[1:] != scores[:-1], True)) if len(scores) else np.zeros(0, np.int64)
+        objects = self._objects.array[:, :: len(AREAS)].sum()
+        return DetectionCurve(
+            confidence=scores[last],
+            precision=ratio(right[last], last + 1),
+            recall=ratio(right[last], float(objects)),
+        )
+
+    def histogram(self, bins: int = 20) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return how many right and wrong boxes (IoU 0.5) fall into equal bins of confidence from 0 to 1."""
+        scores = self._scores.array[:, 0]
+        hit = (self._matched.array[:, 0] & np.uint16(1)) != 0
+        wrong = ~hit & ((self._ignored.array[:, 0] & np.uint16(1)) == 0)
+        edges = np.linspace(0, 1, bins + 1)
+        return np.histogram(scores[hit], edges)[0], np.histogram(scores[wrong], edges)[0]
+
+    def _point_figures(self, weights: NDArray[Any] | None) -> dict[str, FloatArray]:
+        """Precision, recall and F1 at the stated confidence and IoU 0.5, from sums an image."""
+        count = len(self)
+        bit = np.uint16(1)
+        above = self._scores.array[:, 0] > self.confidence
+        hit = ((self._matched.array[:, 0] & bit) != 0) & above
+        wrong = ((self._matched.array[:, 0] & bit) == 0) & ((self._ignored.array[:, 0] & bit) == 0) & above
+        image = self._image.array[:, 0]
+        table = np.stack(
+            [
+                np.bincount(image[hit], minlength=count),
+                np.bincount(image[wrong], minlength=count),
+                self._objects.array[:, :: len(AREAS)].sum(axis=1),
+            ],
+            axis=1,
+        ).astype(np.float64)
+        sums = table.sum(axis=0)[None] if weights is None else np.asarray(weights, np.float64) @ table
+        right, bad, objects = sums.T
+        return {
+            "precision": ratio(right, right + bad),
+            "recall": ratio(right, objects),
+            "f1": ratio(2 * right, right + bad + objects),
+        }
+
+    def figures(self, weights: NDArray[Any] | None = None) -> dict[str, FloatArray]:
+        """Return scores by name under R weightings of the images at once.
+
+        Args:
+            weights: (R, N) how often each image counts; None for once each.
+
+        Returns:
+            Name -> (R,).
+        """
+        ap = self.average_precision(weights)
+        return {
+            "ap50": _mean(ap[:, :, 0]),
+            "ap": _mean(ap.reshape(len(ap), -1)),
+            **self._point_figures(weights),
+        }
+
+    def compute(self) -> DetectionScores:
+        """Return the scores over all images."""
+        ap = self.average_precision()[0]
+        sizes = {
+            name: float(_mean(self.average_precision(area=name)[0].reshape(1, -1))[0])
+            for name in AREAS
+            if name != "all"
+        }
+        curve = self.curve()
+        objects = self._objects.array[:, :: len(AREAS)].sum(axis=1)
+        boxes = np.bincount(self._image.array[:, 0], minlength=len(self))
+        labelled = self._labelled.array[:, 0]
+        empty = labelled & (objects == 0) & (boxes == 0)
+        point = {name: float(value[0]) for name, value in self._point_figures(None).items()}
+        return DetectionScores(
+            images=int((labelled & ~empty).sum()),
+            both_empty=int(empty.sum()),
+            not_labelled=int((~labelled).sum()),
+            objects=int(objects.sum()),
+            boxes=int(((self._ignored.array[:, 0] & np.uint16(1)) == 0).sum()),
+            ap50=float(_mean(ap[None, :, 0])[0]),
+            ap75=float(_mean(ap[None, :, 5])[0]),
+            ap=float(_mean(ap.reshape(1, -1))[0]),
+            ap_small=sizes["small"],
+            ap_medium=sizes["medium"],
+            ap_large=sizes["large"],
+            ap50_by_class={name: float(ap[number, 0]) for number, name in enumerate(self.class_names)},
+            best=_best_point(curve),
+            at=OperatingPoint(self.confidence, **point),
+            recall_all=float(curve.recall[-1]) if len(curve.recall) else (0.0 if objects.sum() else float("nan")),
+        )
+
+    def state(self) -> dict[str, Any]:
+        """Return what was kept, as ``json.dumps`` takes it."""
+        return {
+            "class_names": list(self.class_names),
+            "confidence": self.confidence,
+            "max_boxes": self.max_boxes,
+            "scores": [float(f"{score:.9g}") for score in self._scores.array[:, 0]],
+            "image": self._image.array[:, 0].tolist(),
+            "class_id": self._class.array[:, 0].tolist(),
+            "matched": self._matched.array.tolist(),
+            "ignored": self._ignored.array.tolist(),
+            "objects": self._objects.array.tolist(),
+            "labelled": self._labelled.array[:, 0].astype(int).tolist(),
+            "confusion": self._confusion.tolist(),
+        }
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> DetectionMetric:
+        """Read what `state` returned."""
+        metric = cls(state["class_names"], state["confidence"], state["max_boxes"])
+        areas = len(AREAS)
+        metric._scores.append(np.asarray(state["scores"], np.float32).reshape(-1, 1))
+        metric._image.append(np.asarray(state["image"], np.int32).reshape(-1, 1))
+        metric._class.append(np.asarray(state["class_id"], np.int16).reshape(-1, 1))
+        metric._matched.append(np.asarray(state["matched"], np.uint16).reshape(-1, areas))
+        metric._ignored.append(np.asarray(state["ignored"], np.uint16).reshape(-1, areas))
+        metric._objects.append(np.asarray(state["objects"], np.int32).reshape(-1, areas * len(metric.class_names)))
+        metric._labelled.append(np.asarray(state["labelled"], np.bool_).reshape(-1, 1))
+        metric._confusion = np.asarray(state["confusion"], np.int64)
+        return metric
+
+
+def _area(boxes: FloatArray) -> FloatArray:
+    sides = np.maximum(boxes[:, 2:] - boxes[:, :2], 0)
+    return np.asarray(sides[:, 0] * sides[:, 1], np.float64)
+
+
+def _intersection(boxes: FloatArray, others: FloatArray) -> FloatArray:
+    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
+    sides = np.maximum(high - low, 0)
+    return np.asarray(sides[..., 0] * sides[..., 1], np.float64)
+
+
+def _iou(boxes: FloatArray, others: FloatArray) -> FloatArray:
+    """Return (N, M) intersection over union, in float64 because thresholds are exact."""
+    shared = _intersection(boxes, others)
+    return np.nan_to_num(ratio(shared, _area(boxes)[:, None] + _area(others)[None] - shared))
+
+
+def _cover(boxes: FloatArray, regions: FloatArray) -> FloatArray:
+    """Return (N, M) intersection over the area of the box."""
+    return np.nan_to_num(ratio(_intersection(boxes, regions), _area(boxes)[:, None]))
+
+
+def _ap(hit: NDArray[np.bool_], weight: NDArray[Any] | None, objects: float) -> float:
+    """Return the 101-point AP of boxes sorted by falling confidence."""
+    if not len(hit):
+        return 0.0
+    if weight is None:
+        right = np.cumsum(hit, dtype=np.float64)
+        total = np.arange(1, len(hit) + 1, dtype=np.float64)
+    else:
+        right = np.cumsum(np.where(hit, weight, 0), dtype=np.float64)
+        total = np.cumsum(weight, dtype=np.float64)
+    # Precision is highest right after a hit, so only those positions matter.
+    at = np.flatnonzero(hit)
+    right, total = right[at], total[at]
+    precision = right / (total + _EPS)
+    envelope = np.maximum.accumulate(precision[::-1])[::-1]
+    position = np.searchsorted(right / objects, _RECALLS, side="left")
+    return (
+        float(np.where(position < len(envelope), envelope[np.minimum(position, len(envelope) - 1)], 0).mean())
+        if len(envelope)
+        else 0.0
+    )
+
+
+def _mean(values: FloatArray) -> FloatArray:
+    """Return the mean over the last axis of what is not NaN; NaN where nothing is."""
+    known = ~np.isnan(values)
+    return ratio(np.where(known, values, 0).sum(axis=-1), known.sum(axis=-1))
+
+
+def _best_point(curve: DetectionCurve) -> OperatingPoint:
+    if not len(curve.confidence) or np.isnan(curve.recall).all():
+        return OperatingPoint(float("nan"), float("nan"), float("nan"), float("nan"))
+    f1 = np.nan_to_num(ratio(2 * curve.precision * curve.recall, curve.precision + curve.recall))
+    best = int(f1.argmax())
+    return OperatingPoint(
+        float(curve.confidence[best]), float(curve.precision[best]), float(curve.recall[best]), float(f1[best])
+    )

@@ -1,0 +1,46 @@
+"""A table that grows a row at a time and stays one compact array."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+__all__ = ["Rows"]
+
+
+class Rows:
+    """Rows of numbers in one array that doubles when full.
+
+    Args:
+        columns: Numbers a row.
+        dtype: Their type.
+    """
+
+    def __init__(self, columns: int, dtype: DTypeLike = np.int64) -> None:
+        self._array: NDArray[Any] = np.zeros((64, columns), dtype)
+        self._used = 0
+
+    def __len__(self) -> int:
+        return self._used
+
+    @property
+    def array(self) -> NDArray[Any]:
+        """(rows, columns) view of what was appended."""
+        return self._array[: self._used]
+
+    def append(self, rows: Any) -> None:
+        """Append one row (columns,), or many (n, columns)."""
+        block = np.atleast_2d(np.asarray(rows, self._array.dtype))
+        end = self._used + len(block)
+        if end > len(self._array):
+            grown = np.zeros((max(end, 2 * len(self._array)), self._array.shape[1]), self._array.dtype)
+            grown[: self._used] = self.array
+            self._array = grown
+        self._array[self._used : end] = block
+        self._used = end
+
+    def clear(self) -> None:
+        """Drop all rows."""
+        self._used = 0
