@@ -13,8 +13,10 @@ from trilitenet import errors
 PUBLIC = {
     "Boxes",
     "Perception",
+    "Predictor",
     "__version__",
     "build_network",
+    "load",
     "load_network",
 }
 

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from trilitenet.commands.load import load as load
+    from trilitenet.inference.predictor import Predictor as Predictor
     from trilitenet.models.trilitenet import build_network as build_network
     from trilitenet.models.weights import load_network as load_network
     from trilitenet.structures import Boxes as Boxes
@@ -25,11 +27,13 @@ if TYPE_CHECKING:
 _PUBLIC = {
     "Boxes": "trilitenet.structures",
     "Perception": "trilitenet.structures",
+    "Predictor": "trilitenet.inference.predictor",
     "build_network": "trilitenet.models.trilitenet",
+    "load": "trilitenet.commands.load",
     "load_network": "trilitenet.models.weights",
 }
 
-__all__ = ["Boxes", "Perception", "__version__", "build_network", "load_network"]
+__all__ = ["Boxes", "Perception", "Predictor", "__version__", "build_network", "load", "load_network"]
 
 
 def __getattr__(name: str) -> Any:

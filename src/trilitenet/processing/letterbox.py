@@ -179,7 +179,7 @@ class Letterbox:
             raise ShapeError(f"mask must be {self.canvas} uint8, got {mask.shape} {mask.dtype}")
         inside: NDArray[np.uint8] = mask[self.inside]
         if self.resized == self.source:
-            return inside.copy()
+            return np.array(inside)
         return np.asarray(cv2.resize(inside, self.source[::-1], interpolation=cv2.INTER_LINEAR), np.uint8)
 
     def _resize(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:

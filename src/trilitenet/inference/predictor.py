@@ -1,0 +1,167 @@
+"""From an image to a `Perception`, in named stages, so that a runtime replaces only the middle one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TypeAlias, overload
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from trilitenet.config import LONG_SIDE, ModelCard, Thresholds
+from trilitenet.errors import ConfigError
+from trilitenet.inference.backend import Backend
+from trilitenet.processing.images import read_image
+from trilitenet.processing.letterbox import Letterbox
+from trilitenet.processing.postprocess import to_perceptions
+from trilitenet.structures import Perception, RawOutputs
+
+__all__ = ["ImageLike", "Predictor"]
+
+ImageLike: TypeAlias = str | Path | bytes | Image.Image | NDArray[Any]
+"""A path, the bytes of an image file, a Pillow image, or a (height, width, 3) uint8 **RGB** array."""
+
+
+class Predictor:
+    """What a user holds: call it with an image, get a `Perception`.
+
+        predictor = trilitenet.load("tiny")
+        perception = predictor("photo.jpg")
+        perceptions = predictor([image, another])
+
+    The stages are `preprocess`, ``backend.run`` and `postprocess`; calling the predictor does all three.
+
+    Args:
+        backend: The network on a runtime.
+        thresholds: What counts as an object, drivable or lane; the card's if left out.
+        long_side: The longer side of an image is resized to so many pixels, where the backend's input is not fixed.
+        batch_size: At most so many images go through the network at once.
+
+    Raises:
+        ConfigError: If a size is not positive.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        thresholds: Thresholds | None = None,
+        *,
+        long_side: int = LONG_SIDE,
+        batch_size: int = 8,
+    ) -> None:
+        if min(long_side, batch_size) < 1:
+            raise ConfigError(f"long_side and batch_size must be at least 1, got {long_side} and {batch_size}")
+        self.backend = backend
+        self.thresholds = thresholds or backend.card.thresholds
+        self.long_side = long_side
+        self.batch_size = batch_size
+
+    @property
+    def card(self) -> ModelCard:
+        """What the network is: classes, tasks, training data, figures, licence."""
+        return self.backend.card
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names of the detection classes."""
+        return self.backend.card.class_names
+
+    @overload
+    def __call__(self, image: ImageLike) -> Perception: ...  # type: ignore[overload-overlap]  # text is a path
+    @overload
+    def __call__(self, image: Sequence[ImageLike]) -> list[Perception]: ...
+
+    def __call__(self, image: ImageLike | Sequence[ImageLike]) -> Perception | list[Perception]:
+        """Perceive one image or several.
+
+        Args:
+            image: An `ImageLike` of any size, or a list of them (their sizes may differ).
+
+        Returns:
+            A `Perception` for an image, a list of them for a list. Each keeps its source image, for drawing.
+
+        Raises:
+            InputError: If a file is missing, broken or no image.
+            ShapeError: If an array is of the wrong shape or type.
+        """
+        if isinstance(image, (str, Path, bytes, Image.Image, np.ndarray)):
+            return self.perceive([read_image(image)], [_name(image)])[0]
+        return self.perceive([read_image(one) for one in image], [_name(one) for one in image])
+
+    def perceive(
+        self, images: Sequence[NDArray[np.uint8]], sources: Sequence[str | None] | None = None
+    ) -> list[Perception]:
+        """Perceive images that are in memory; neighbours of one canvas size share a batch.
+
+        Args:
+            images: (height, width, 3) uint8 RGB each.
+            sources: Where each came from.
+        """
+        perceptions: list[Perception] = []
+        letterboxes = [self.fit(image) for image in images]
+        for part in _runs([letterbox.canvas for letterbox in letterboxes], self.batch_size):
+            batch = np.empty((part.stop - part.start, *letterboxes[part.start].canvas, 3), np.uint8)
+            for canvas, image, letterbox in zip(batch, images[part], letterboxes[part], strict=True):
+                letterbox.image(image, out=canvas)
+            raw = self.backend.run(batch)
+            perceptions += self.postprocess(
+                raw, letterboxes[part], images[part], None if sources is None else sources[part]
+            )
+        return perceptions
+
+    def fit(self, image: NDArray[np.uint8]) -> Letterbox:
+        """Return how an image is fitted into the network's input."""
+        height, width = image.shape[:2]
+        return Letterbox.fit((height, width), long_side=self.long_side, canvas=self.backend.canvas)
+
+    def preprocess(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Letterbox]:
+        """Letterbox one image.
+
+        Args:
+            image: (height, width, 3) uint8 RGB.
+
+        Returns:
+            The (canvas height, canvas width, 3) uint8 canvas, and how the image lies in it.
+        """
+        letterbox = self.fit(image)
+        return letterbox.image(image), letterbox
+
+    def postprocess(
+        self,
+        raw: RawOutputs,
+        letterboxes: Sequence[Letterbox],
+        images: Sequence[NDArray[np.uint8]] | None = None,
+        sources: Sequence[str | None] | None = None,
+    ) -> list[Perception]:
+        """Turn the raw outputs of a batch into perceptions; see `to_perceptions`."""
+        return to_perceptions(raw, letterboxes, self.thresholds, self.class_names, images, sources)
+
+    def close(self) -> None:
+        """Free what the runtime holds."""
+        self.backend.close()
+
+    def __enter__(self) -> Predictor:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _name(image: ImageLike) -> str | None:
+    return str(image) if isinstance(image, (str, Path)) else None
+
+
+def _runs(values: Sequence[object], longest: int) -> list[slice]:
+    """Cut a sequence into runs of equal neighbours, none longer than ``longest``."""
+    runs: list[slice] = []
+    start = 0
+    for stop in range(1, len(values) + 1):
+        if stop == len(values) or values[stop] != values[start] or stop - start == longest:
+            runs.append(slice(start, stop))
+            start = stop
+    return runs

@@ -1,0 +1,95 @@
+"""The network on PyTorch: CPU, CUDA or Apple's MPS."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from trilitenet.config import ModelCard
+from trilitenet.errors import BackendError
+from trilitenet.models.trilitenet import TriLiteNet, normalise_images
+from trilitenet.structures import RawOutputs
+
+__all__ = ["TorchBackend", "pick_device"]
+
+
+def pick_device(device: str = "auto") -> torch.device:
+    """Return the device called ``device``; ``"auto"`` is CUDA, else MPS, else the CPU.
+
+    Raises:
+        BackendError: If there is no such device here.
+    """
+    if device == "auto":
+        if torch.cuda.is_available():
+            return torch.device("cuda")
+        return torch.device("mps" if torch.backends.mps.is_available() else "cpu")
+    try:
+        chosen = torch.device(device)
+        torch.empty(0, device=chosen)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).partition("\n")[0].rstrip(".")
+        raise BackendError(f"device {device!r} cannot be used ({reason}); try 'cpu'") from error
+    return chosen
+
+
+class TorchBackend:
+    """A network on PyTorch.
+
+    Args:
+        network: The network; it is moved to the device and put in evaluation mode.
+        device: As `pick_device` takes it.
+
+    Raises:
+        BackendError: If the device cannot be used.
+    """
+
+    def __init__(self, network: TriLiteNet, device: str = "auto") -> None:
+        self.device = pick_device(device)
+        self.network: TriLiteNet = network.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+
+    @property
+    def card(self) -> ModelCard:
+        """What the network is."""
+        return self.network.card
+
+    @property
+    def name(self) -> str:
+        """The runtime and the device."""
+        return f"torch {self.device}"
+
+    @property
+    def canvas(self) -> tuple[int, int] | None:
+        """None: any size in multiples of 32 will do."""
+        return None
+
+    def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
+        """Run the network on (B, H, W, 3) uint8 RGB; see `Backend.run`."""
+        try:
+            with torch.inference_mode():
+                # NHWC seen as NCHW is the channels-last memory format: nothing is copied.
+                images = torch.from_numpy(batch).to(self.device, non_blocking=True).permute(0, 3, 1, 2)
+                outputs = self.network(normalise_images(images, self.card.mean, self.card.std))
+                return RawOutputs(
+                    detection=(
+                        None if outputs.detection is None else self.network.decode(outputs).float().cpu().numpy()
+                    ),
+                    drivable=None if outputs.drivable is None else _foreground(outputs.drivable),
+                    lane=None if outputs.lane is None else _foreground(outputs.lane),
+                )
+        except torch.OutOfMemoryError as error:
+            raise BackendError(
+                f"{self.name} is out of memory for {len(batch)} images of {batch.shape[2]}x{batch.shape[1]}; "
+                "use a smaller batch"
+            ) from error
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+
+def _foreground(logits: Tensor) -> NDArray[np.uint8]:
+    """Return (B, H, W) uint8, soft-max probability of the second of two channels x 255."""
+    probability = (logits[:, 1] - logits[:, 0]).float().sigmoid_()
+    mask: NDArray[np.uint8] = probability.mul_(255).round_().to(torch.uint8).cpu().numpy()
+    return mask

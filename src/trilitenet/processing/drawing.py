@@ -1,0 +1,209 @@
+"""Results drawn on the image: masks with soft edges, boxes and labels, in colours that colour-blind people tell apart.
+
+Colours are those of Okabe and Ito (2008), RGB. The drawing functions change the (height, width, 3) uint8 RGB canvas
+they are given; `draw` makes the copy.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Collection
+from typing import Final, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from trilitenet.errors import ConfigError, ShapeError, did_you_mean
+from trilitenet.structures import Boxes, Perception
+
+__all__ = [
+    "BOX_COLOURS",
+    "DRIVABLE_COLOUR",
+    "LANE_COLOUR",
+    "PARTS",
+    "blend_masks",
+    "check_parts",
+    "draw",
+    "draw_boxes",
+    "draw_label",
+]
+
+Colour: TypeAlias = tuple[int, int, int]
+
+DRIVABLE_COLOUR: Final[Colour] = (0, 158, 115)
+LANE_COLOUR: Final[Colour] = (240, 228, 66)
+BOX_COLOURS: Final[tuple[Colour, ...]] = (
+    (86, 180, 233),
+    (230, 159, 0),
+    (204, 121, 167),
+    (213, 94, 0),
+    (0, 114, 178),
+)
+"""Colours of objects, by class, or by track where there are tracks."""
+
+PARTS: Final = ("drivable", "lane", "boxes", "labels")
+"""Parts of the picture that can be left out."""
+
+_OPACITY: Final = {"drivable": 0.42, "lane": 0.85}
+_MASK_SIDE: Final = 640
+"""Masks are blended at no more than this on the long side and brought to full size smoothly: quick, and soft."""
+
+
+def check_parts(hide: Collection[str], known: Collection[str] = PARTS) -> frozenset[str]:
+    """Return ``hide`` as a set.
+
+    Raises:
+        ConfigError: If a part is unknown; the message names the nearest.
+    """
+    for part in hide:
+        if part not in known:
+            raise ConfigError(f"unknown part {part!r} of the overlay{did_you_mean(part, known)}")
+    return frozenset(hide)
+
+
+def draw(
+    perception: Perception,
+    image: NDArray[np.uint8] | None = None,
+    *,
+    hide: Collection[str] = (),
+    out: NDArray[np.uint8] | None = None,
+) -> NDArray[np.uint8]:
+    """Return a copy of the image with the three tasks drawn on it.
+
+    Args:
+        perception: What to draw.
+        image: (height, width, 3) uint8 RGB to draw on; the perception's own if left out.
+        hide: Parts to leave out, of `PARTS`.
+        out: Where to draw; may be ``image`` itself. Made if left out.
+
+    Returns:
+        (height, width, 3) uint8 RGB, ``out`` if it was given.
+
+    Raises:
+        ShapeError: If there is no image, or one of another size.
+        ConfigError: If a part is unknown.
+    """
+    hidden = check_parts(hide)
+    image = perception.image if image is None else image
+    if image is None:
+        raise ShapeError("this perception did not keep its image; pass one: perception.draw(image)")
+    if image.shape != (*perception.size, 3) or image.dtype != np.uint8:
+        raise ShapeError(f"the image must be {(*perception.size, 3)} uint8, got {image.shape} {image.dtype}")
+    canvas = np.empty_like(image, order="C") if out is None else out
+    if canvas is not image:
+        np.copyto(canvas, image)
+    layers = {
+        name: mask
+        for name, mask in (("drivable", perception.drivable), ("lane", perception.lane))
+        if mask is not None and name not in hidden
+    }
+    blend_masks(canvas, layers)
+    if perception.boxes is not None and "boxes" not in hidden:
+        draw_boxes(canvas, perception.boxes, perception.class_names, labels="labels" not in hidden)
+    return canvas
+
+
+def blend_masks(canvas: NDArray[np.uint8], masks: dict[str, NDArray[np.bool_]]) -> None:
+    """Tint drivable area and lane markings, lane on top, with soft edges.
+
+    Args:
+        canvas: (height, width, 3) uint8 RGB, changed in place.
+        masks: (height, width) bool under ``"drivable"`` and ``"lane"``.
+    """
+    if not masks:
+        return
+    rows = functools.reduce(np.logical_or, (mask.any(axis=1) for mask in masks.values())).nonzero()[0]
+    if not len(rows):
+        return
+    # Only the rows that have something, and one more pixel of the smaller grid on both sides for the soft edge.
+    height, width = canvas.shape[:2]
+    step = max(1, -(-max(height, width) // _MASK_SIDE))
+    top = max(0, int(rows[0]) // step * step - 2 * step)
+    bottom = min(height, int(rows[-1]) + 1 + 2 * step)
+    part = canvas[top:bottom]
+    size = (-(-width // step), -(-(bottom - top) // step))
+    weights = [np.zeros(size[::-1], np.float32)] * 2
+    for index, name in enumerate(("drivable", "lane")):
+        if name in masks:
+            mask = masks[name][top:bottom].view(np.uint8) * np.uint8(255)
+            if step > 1:
+                mask = cv2.resize(mask, size, interpolation=cv2.INTER_AREA)
+            weights[index] = cv2.GaussianBlur(mask, (3, 3), 0) * np.float32(_OPACITY[name] / 255)
+    weights[0] = weights[0] * (1 - weights[1])  # lane markings lie on top
+    drivable, lane = weights
+    tint = cv2.merge(
+        [drivable * np.float32(a) + lane * np.float32(b) for a, b in zip(DRIVABLE_COLOUR, LANE_COLOUR, strict=True)]
+    )
+    tint, kept = cv2.convertScaleAbs(tint), cv2.convertScaleAbs((1 - drivable - lane) * np.float32(255))
+    if step > 1:
+        tint = cv2.resize(tint, (width, bottom - top), interpolation=cv2.INTER_LINEAR)
+        kept = cv2.resize(kept, (width, bottom - top), interpolation=cv2.INTER_LINEAR)
+    kept = cv2.merge([kept] * 3)
+    cv2.multiply(part, kept, dst=part, scale=1 / 255)
+    cv2.add(part, tint, dst=part)
+
+
+def draw_boxes(canvas: NDArray[np.uint8], boxes: Boxes, class_names: tuple[str, ...], *, labels: bool = True) -> None:
+    """Draw boxes, the surest on top, each with its name and confidence.
+
+    Args:
+        canvas: (height, width, 3) uint8 RGB, changed in place.
+        boxes: In pixels of the canvas.
+        class_names: Names of the classes.
+        labels: Write the labels too.
+    """
+    height, width = canvas.shape[:2]
+    thickness = max(1, round(max(height, width) / 500))
+    for i in range(len(boxes) - 1, -1, -1):
+        track = -1 if boxes.track_id is None else int(boxes.track_id[i])
+        class_id = int(boxes.class_id[i])
+        colour = BOX_COLOURS[(track if track >= 0 else class_id) % len(BOX_COLOURS)]
+        left, top, right, bottom = (round(float(value)) for value in boxes.xyxy[i])
+        cv2.rectangle(canvas, (left, top), (right, bottom), colour, thickness)
+        if labels:
+            name = class_names[class_id]
+            text = f"{name} {boxes.confidence[i]:.2f}" if track < 0 else f"{name} {track}"
+            draw_label(canvas, text, (left, top), colour)
+
+
+def draw_label(
+    canvas: NDArray[np.uint8], text: str, corner: tuple[int, int], colour: Colour, *, size: int | None = None
+) -> None:
+    """Write text on a plate whose lower left corner is ``corner``, kept inside the canvas.
+
+    Args:
+        canvas: (height, width, 3) uint8 RGB, changed in place.
+        text: One line.
+        corner: (x, y) in pixels.
+        colour: Of the plate; the text is black or white, whichever is easier to read.
+        size: Height of the letters in pixels; by the canvas if left out.
+    """
+    height, width = canvas.shape[:2]
+    plate = _plate(text, size or max(10, round(max(height, width) / 64)), colour)
+    plate = plate[:height, :width]
+    left = min(max(corner[0], 0), width - plate.shape[1])
+    top = corner[1] - plate.shape[0]
+    if top < 0:
+        top = corner[1]
+    top = min(max(top, 0), height - plate.shape[0])
+    canvas[top : top + plate.shape[0], left : left + plate.shape[1]] = plate
+
+
+@functools.lru_cache(maxsize=4096)
+def _plate(text: str, size: int, colour: Colour) -> NDArray[np.uint8]:
+    font = _font(size)
+    left, _, right, _ = font.getbbox(text, anchor="ls")
+    above, below = font.getbbox("Ag", anchor="ls")[1::2]
+    margin = max(2, size // 4)
+    plate = Image.new("RGB", (int(right - left) + 2 * margin, int(below - above) + margin), colour)
+    luminance = 0.299 * colour[0] + 0.587 * colour[1] + 0.114 * colour[2]
+    ink = (0, 0, 0) if luminance > 110 else (255, 255, 255)
+    ImageDraw.Draw(plate).text((margin - left, margin // 2 - above), text, fill=ink, font=font, anchor="ls")
+    return np.asarray(plate, np.uint8)
+
+
+@functools.lru_cache(maxsize=16)
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)

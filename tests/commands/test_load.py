@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import trilitenet
+from trilitenet.config import Thresholds
+from trilitenet.errors import BackendError, ConfigError, WeightsError
+from trilitenet.models.trilitenet import build_network
+from trilitenet.models.weights import save_network
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    network = build_network("tiny")
+    save_network(network, tmp_path / "random.safetensors", network.card)
+    return tmp_path / "random.safetensors"
+
+
+def test_load_gives_a_predictor(weights: Path) -> None:
+    predictor = trilitenet.load(weights, device="cpu")
+    assert isinstance(predictor, trilitenet.Predictor)
+    perception = predictor(np.zeros((90, 160, 3), np.uint8))
+    assert perception.size == (90, 160)
+    assert perception.draw().shape == (90, 160, 3)
+    assert perception.to_dict()["size"] == {"height": 90, "width": 160}
+
+
+def test_thresholds_can_be_overridden_one_by_one(weights: Path) -> None:
+    predictor = trilitenet.load(weights, device="cpu", confidence=0.7, lane=0.2)
+    assert predictor.thresholds == Thresholds(confidence=0.7, lane=0.2)
+
+
+def test_mistakes_are_named(weights: Path) -> None:
+    with pytest.raises(ConfigError, match="did you mean 'torch'"):
+        trilitenet.load(weights, backend="toch")
+    with pytest.raises(ConfigError, match="confidence must be between 0 and 1"):
+        trilitenet.load(weights, device="cpu", confidence=7)
+    with pytest.raises(BackendError, match="cuda:99"):
+        trilitenet.load(weights, device="cuda:99")
+    with pytest.raises(WeightsError, match="does not exist"):
+        trilitenet.load("nowhere.safetensors")

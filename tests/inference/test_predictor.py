@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from tests.fakes import ColourBackend, coloured_scene
+
+from trilitenet.config import Thresholds
+from trilitenet.errors import ConfigError, InputError
+from trilitenet.inference.backend import Backend
+from trilitenet.inference.predictor import Predictor
+
+
+def check(perception: object, height: int, width: int) -> None:
+    from trilitenet import Perception
+
+    assert isinstance(perception, Perception)
+    assert perception.size == (height, width)
+    assert perception.boxes is not None
+    tolerance = max(height, width) / 640 + 1
+    np.testing.assert_allclose(
+        perception.boxes.xyxy, [[width / 4, height / 4, width / 2, height / 2]], atol=2 * tolerance
+    )
+    assert perception.drivable is not None
+    assert perception.drivable.shape == (height, width)
+    assert perception.drivable[-1, 5]
+    assert not perception.drivable[: height // 2 - 4].any()
+    assert perception.lane is not None
+    assert perception.lane[-1, width // 2 + 2]
+
+
+def test_the_fake_is_a_backend() -> None:
+    assert isinstance(ColourBackend(), Backend)
+
+
+@pytest.mark.parametrize("size", [(360, 640), (720, 1280), (480, 360), (193, 640), (1000, 333)])
+def test_any_size(size: tuple[int, int]) -> None:
+    backend = ColourBackend()
+    check(Predictor(backend)(coloured_scene(*size)), *size)
+    assert backend.batches[0][1] % 32 == backend.batches[0][2] % 32 == 0
+
+
+def test_a_fixed_canvas_is_honoured() -> None:
+    backend = ColourBackend(canvas=(384, 640))
+    check(Predictor(backend)(coloured_scene(480, 480)), 480, 480)
+    assert backend.batches == [(1, 384, 640, 3)]
+
+
+def test_kinds_of_input(tmp_path: Path) -> None:
+    scene = coloured_scene()
+    path = tmp_path / "scene.png"
+    Image.fromarray(scene).save(path)
+    predictor = Predictor(ColourBackend())
+    for image in (path, str(path), path.read_bytes(), Image.fromarray(scene), scene):
+        check(predictor(image), 360, 640)
+    assert predictor(path).source == str(path)
+    assert predictor(scene).source is None
+    np.testing.assert_array_equal(predictor(path).image, scene)
+
+
+def test_a_list_is_batched_by_canvas_size_and_stays_in_order() -> None:
+    backend = ColourBackend()
+    sizes = [(360, 640)] * 5 + [(480, 360)] * 2 + [(360, 640)]
+    perceptions = Predictor(backend, batch_size=4)([coloured_scene(*size) for size in sizes])
+    assert [perception.size for perception in perceptions] == sizes
+    assert [shape[0] for shape in backend.batches] == [4, 1, 2, 1]
+    for perception, size in zip(perceptions, sizes, strict=True):
+        check(perception, *size)
+    assert Predictor(backend)([]) == []
+
+
+def test_stages_make_the_whole() -> None:
+    predictor = Predictor(ColourBackend())
+    scene = coloured_scene(720, 1280)
+    canvas, letterbox = predictor.preprocess(scene)
+    assert canvas.shape == (384, 640, 3)
+    (perception,) = predictor.postprocess(predictor.backend.run(canvas[None]), [letterbox], [scene])
+    assert perception.to_dict() == predictor(scene).to_dict()
+
+
+def test_thresholds_come_from_the_card_or_the_caller() -> None:
+    scene = coloured_scene()
+    assert len(Predictor(ColourBackend())(scene).boxes or ()) == 1
+    assert len(Predictor(ColourBackend(), Thresholds(confidence=0.95))(scene).boxes or ()) == 0
+
+
+def test_errors() -> None:
+    with pytest.raises(InputError, match="no such file"):
+        Predictor(ColourBackend())("absent.jpg")
+    with pytest.raises(ConfigError, match="at least 1"):
+        Predictor(ColourBackend(), batch_size=0)
+
+
+def test_it_closes_its_backend() -> None:
+    backend = ColourBackend()
+    with Predictor(backend):
+        pass
+    assert backend.closed == 1

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from trilitenet.errors import BackendError, ShapeError
+from trilitenet.inference.torch_backend import TorchBackend, pick_device
+from trilitenet.models.trilitenet import build_network
+
+
+@pytest.fixture
+def backend() -> TorchBackend:
+    torch.manual_seed(0)
+    return TorchBackend(build_network("tiny"), "cpu")
+
+
+def test_outputs_are_the_networks(backend: TorchBackend, rng: np.random.Generator) -> None:
+    batch = rng.integers(0, 256, (2, 64, 96, 3), dtype=np.uint8)
+    raw = backend.run(batch)
+    mean, std = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
+    images = torch.from_numpy(((batch / 255 - mean) / std).transpose(0, 3, 1, 2)).float()
+    with torch.no_grad():
+        outputs = backend.network(images)
+        expected = backend.network.decode(outputs).numpy()
+    assert raw.detection is not None
+    np.testing.assert_allclose(raw.detection, expected, rtol=1e-4, atol=1e-4)
+    for mask, logits in ((raw.drivable, outputs.drivable), (raw.lane, outputs.lane)):
+        probability = logits.softmax(1)[:, 1].numpy() * 255
+        assert mask is not None
+        assert mask.shape == (2, 64, 96)
+        assert np.abs(mask.astype(float) - probability).max() <= 0.51
+
+
+def test_a_batch_is_the_same_as_its_images(backend: TorchBackend, rng: np.random.Generator) -> None:
+    batch = rng.integers(0, 256, (3, 64, 96, 3), dtype=np.uint8)
+    together = backend.run(batch).detection
+    assert together is not None
+    for i in range(3):
+        alone = backend.run(batch[i : i + 1]).detection
+        assert alone is not None
+        np.testing.assert_allclose(together[i], alone[0], rtol=1e-3, atol=1e-3)
+
+
+def test_tasks_it_lacks_are_none() -> None:
+    raw = TorchBackend(build_network("tiny", tasks=("lane",)), "cpu").run(np.zeros((1, 64, 64, 3), np.uint8))
+    assert raw.detection is None
+    assert raw.drivable is None
+    assert raw.lane is not None
+
+
+def test_name_and_canvas(backend: TorchBackend) -> None:
+    assert backend.name == "torch cpu"
+    assert backend.canvas is None
+    assert backend.card.variant == "tiny"
+    backend.close()
+
+
+def test_sizes_that_are_no_multiple_of_32_are_refused(backend: TorchBackend) -> None:
+    with pytest.raises(ShapeError, match="multiples of 32"):
+        backend.run(np.zeros((1, 60, 96, 3), np.uint8))
+
+
+@pytest.mark.parametrize("device", ["cuda:99", "nonsense", "meta:x"])
+def test_a_device_that_is_not_there_is_named(device: str) -> None:
+    with pytest.raises(BackendError, match=device):
+        pick_device(device)
+
+
+def test_auto_finds_a_device() -> None:
+    assert pick_device().type in {"cpu", "cuda", "mps"}

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import copy
+import json
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+from pycocotools import mask as coco_mask
+
+from trilitenet.errors import ShapeError
+from trilitenet.processing.serialise import decode_mask, encode_mask
+from trilitenet.structures import Boxes, Perception
+
+
+def perception(*, track: bool = False) -> Perception:
+    rng = np.random.default_rng(0)
+    return Perception(
+        size=(40, 60),
+        class_names=("car", "bus"),
+        boxes=Boxes(
+            np.array([[1.25, 2, 30, 20.5], [5, 5, 9, 9]], np.float32),
+            np.array([0.9, 0.5], np.float32),
+            np.array([0, 1]),
+            np.array([7, -1]) if track else None,
+        ),
+        drivable=rng.random((40, 60)) > 0.5,
+        lane=np.zeros((40, 60), bool),
+        source="a.mp4",
+        frame=3,
+        timestamp=0.1,
+    )
+
+
+@pytest.mark.parametrize("track", [False, True])
+def test_json_there_and_back(track: bool) -> None:
+    before = perception(track=track)
+    text = json.dumps(before.to_dict())
+    after = Perception.from_dict(json.loads(text))
+    assert json.dumps(after.to_dict()) == text
+    assert before.boxes is not None
+    assert after.boxes is not None
+    np.testing.assert_array_equal(after.boxes.xyxy, before.boxes.xyxy)
+    np.testing.assert_array_equal(after.drivable, before.drivable)
+    np.testing.assert_array_equal(after.lane, before.lane)
+    assert (after.boxes.track_id is not None) == track
+
+
+def test_masks_are_what_coco_tools_read() -> None:
+    rng = np.random.default_rng(1)
+    for density in (0.0, 0.02, 0.5, 1.0):
+        mask = rng.random((37, 53)) < density
+        mask[:, 20:30] = True
+        encoded = encode_mask(mask)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # pycocotools' own, about NumPy 2
+            np.testing.assert_array_equal(coco_mask.decode(encoded), mask)
+        np.testing.assert_array_equal(decode_mask(encoded), mask)
+
+
+def test_an_absent_task_is_null_and_an_empty_one_is_empty() -> None:
+    absent = Perception(size=(4, 4)).to_dict()
+    assert absent["boxes"] is absent["drivable"] is absent["lane"] is None
+    empty = Perception.from_dict(Perception(size=(4, 4), boxes=Boxes.empty()).to_dict())
+    assert empty.boxes is not None
+    assert len(empty.boxes) == 0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"schema": "2.0"},
+        {"schema": None},
+        {"size": [4, 4]},
+        {"boxes": [{"xyxy": [1, 2, 3]}]},
+        {"drivable": {"size": [40, 60]}},
+        {"drivable": {"size": [1, 1], "counts": "PPn0"}},
+        {"lane": "x"},
+        {"lane": {"size": [40, 60], "counts": ""}},
+        {"lane": {"size": [40, 60], "counts": "P"}},
+        {"lane": {"size": [40, 60], "counts": "ooooooooooooooo0"}},
+        {"lane": {"size": [-40, -60], "counts": "PPn0"}},
+        {"class_names": ["car"]},
+    ],
+)
+def test_what_is_not_that_form_is_refused(change: dict[str, Any]) -> None:
+    mapping = copy.deepcopy(perception().to_dict()) | change
+    with pytest.raises(ShapeError):
+        Perception.from_dict(mapping)
