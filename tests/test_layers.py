@@ -50,3 +50,9 @@ def test_test_files_mirror_the_package() -> None:
     layers = {path.name for path in PACKAGE.iterdir() if path.is_dir() and (path / "__init__.py").exists()}
     folders = {path.name for path in (ROOT / "tests").iterdir() if path.is_dir() and any(path.glob("test_*.py"))}
     assert folders <= layers | {"parity", "benchmarks", "recipes"}
+
+
+def test_every_test_folder_is_a_package() -> None:
+    """Two test files of one name, in two layers, clash unless their folders are packages."""
+    folders = {path.parent for path in (ROOT / "tests").rglob("test_*.py")}
+    assert not {folder for folder in folders if not (folder / "__init__.py").exists()}

@@ -1,0 +1,203 @@
+"""What every writer is: it takes perceptions one by one and leaves files of one format.
+
+    with open_writer("coco", Path("results")) as writer:
+        for perception in perceptions:
+            writer.write(perception)
+    print(writer.files)
+
+Memory stays flat over any number of frames, unless a format's own layout forbids it (said where it does). A file gets
+its final name when it is whole: until then it ends in ``.part``.
+"""
+
+from __future__ import annotations
+
+import abc
+import contextlib
+import importlib
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path, PurePath
+from types import TracebackType
+from typing import IO, TYPE_CHECKING, Any, Final
+
+from trilitenet.errors import ConfigError, OutputError, did_you_mean
+from trilitenet.structures import Perception
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+__all__ = ["WRITERS", "JsonStream", "Writer", "open_writer"]
+
+WRITERS: Final[dict[str, str]] = {
+    "json": "trilitenet.formats.writers.native:JsonWriter",
+    "jsonl": "trilitenet.formats.writers.native:JsonLinesWriter",
+    "scalabel": "trilitenet.formats.writers.scalabel:ScalabelWriter",
+    "openlabel": "trilitenet.formats.writers.openlabel:OpenLabelWriter",
+    "coco": "trilitenet.formats.writers.coco:CocoWriter",
+    "yolo": "trilitenet.formats.writers.yolo:YoloWriter",
+    "cvat": "trilitenet.formats.writers.cvat:CvatWriter",
+    "parquet": "trilitenet.formats.writers.tables:ParquetWriter",
+    "csv": "trilitenet.formats.writers.tables:CsvWriter",
+}
+"""The name a user gives to ``--format`` -> where its writer lives; imported when asked for."""
+
+
+class Writer(abc.ABC):
+    """Takes perceptions one by one, and writes files of one format into a folder.
+
+    Frames of a video come in order, and one video is finished before the next source starts.
+
+    Args:
+        output: The folder; made if it does not exist.
+        overwrite: Replace files that exist.
+
+    Attributes:
+        files: The files that are whole so far.
+    """
+
+    def __init__(self, output: Path, *, overwrite: bool = False) -> None:
+        self.output = output
+        self.overwrite = overwrite
+        self.files: list[Path] = []
+        self._stems: dict[str, str] = {}
+        self._names: dict[str, str] = {}
+        self._unnamed = 0
+
+    @abc.abstractmethod
+    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+        """Write one image or frame.
+
+        Args:
+            perception: What the network sees.
+            road: What follows from it for the road, as its ``to_dict`` gives; a format that has no place for it
+                leaves it out.
+
+        Raises:
+            OutputError: If a file exists and may not be replaced, or cannot be written.
+        """
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Finish every file; a writer can be closed twice."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def create(self, name: str) -> Path:
+        """Return the path of a file to write, in a folder that exists.
+
+        Raises:
+            OutputError: If it exists and ``overwrite`` was not asked for, or the folder cannot be made.
+        """
+        path = self.output / name
+        if path.exists() and not self.overwrite:
+            raise OutputError(f"{path} exists; choose another --output or add --overwrite")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{path.parent}: cannot be made ({error.strerror})") from error
+        return path
+
+    def finish(self, partial: Path, path: Path) -> None:
+        """Give a whole file its final name."""
+        partial.replace(path)
+        self.files.append(path)
+
+    def stem(self, perception: Perception) -> str:
+        """Return a file name without ending for the perception's source: the same for all frames of a video.
+
+        Two sources of the same name are told apart by ``-2``, ``-3`` ...
+        """
+        source = perception.source
+        if source is None:
+            self._unnamed += 1
+            return f"image-{self._unnamed:06d}"
+        if source not in self._stems:
+            stem = PurePath(source).stem or "image"
+            taken = set(self._stems.values())
+            number = 1
+            name = stem
+            while name in taken:
+                number += 1
+                name = f"{stem}-{number}"
+            self._stems[source] = name
+        return self._stems[source]
+
+    def image_name(self, perception: Perception) -> str:
+        """Return the name of the picture as data sets list it.
+
+        A still image keeps its file name (its whole path where that name is taken by another); a frame of a video gets
+        ``NAME-0000012.jpg``, as the frames of BDD100K's videos are called.
+        """
+        stem = self.stem(perception)
+        if perception.frame is not None:
+            return f"{stem}-{perception.frame:07d}.jpg"
+        if perception.source is None:
+            return f"{stem}.jpg"
+        name = PurePath(perception.source).name
+        owner = self._names.setdefault(name, perception.source)
+        return name if owner == perception.source else PurePath(perception.source).as_posix()
+
+
+def open_writer(format: str, output: Path, *, overwrite: bool = False, **options: Any) -> Writer:
+    """Return the writer of a format.
+
+    Args:
+        format: One of `WRITERS`.
+        output: The folder to write into.
+        overwrite: Replace files that exist.
+        options: What the format's own writer takes besides.
+
+    Raises:
+        ConfigError: If the format is unknown.
+        MissingExtraError: If the format needs a package that is not installed.
+    """
+    if format not in WRITERS:
+        raise ConfigError(f"unknown format {format!r}{did_you_mean(format, WRITERS)}")
+    module, _, name = WRITERS[format].partition(":")
+    writer: Writer = getattr(importlib.import_module(module), name)(output, overwrite=overwrite, **options)
+    return writer
+
+
+class JsonStream:
+    """A JSON document written piece by piece: one long list or object between a head and a tail.
+
+    Args:
+        path: The file; its final name comes with `close`.
+        head: JSON text up to the first element, such as ``{"frames": [``.
+    """
+
+    def __init__(self, path: Path, head: str) -> None:
+        self.path = path
+        self.partial = path.with_name(f"{path.name}.part")
+        self._handle: IO[str] = self.partial.open("w", encoding="utf-8")
+        self._handle.write(head)
+        self._first = True
+
+    def add(self, value: Any, key: str | None = None) -> None:
+        """Write the next element of the list, or the next member of the object."""
+        self._handle.write("\n" if self._first else ",\n")
+        self._first = False
+        if key is not None:
+            self._handle.write(f"{json.dumps(key)}: ")
+        self._handle.write(dumps(value))
+
+    def close(self, tail: str) -> None:
+        """Write the JSON text after the last element, and close the file."""
+        with contextlib.closing(self._handle) as handle:
+            handle.write(f"\n{tail}\n")
+
+
+def dumps(value: Any) -> str:
+    """Return one line of JSON; not-a-number and infinity are refused, because JSON has neither."""
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+def rounded(values: Any, digits: int = 2) -> Iterator[float]:
+    """Yield plain floats, rounded: pixels to a hundredth by default."""
+    return (round(float(value), digits) for value in values)

@@ -1,0 +1,93 @@
+"""COCO's annotation file: pictures, boxes and run-length masks in one JSON.
+
+Format: https://cocodataset.org/#format-data, with ``score`` as in its results format.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from trilitenet.formats.writers.base import JsonStream, Writer, dumps, rounded
+from trilitenet.processing.serialise import encode_mask
+from trilitenet.structures import Perception
+
+__all__ = ["CocoWriter"]
+
+
+class CocoWriter(Writer):
+    """Writes ``coco.json``.
+
+    The classes have the category ids 1, 2, ...; after them come ``drivable`` and ``lane``, whose annotations are one
+    run-length mask an image. The list of images is held until the end: about 200 bytes a frame.
+
+    Args:
+        output: The folder.
+        overwrite: Replace files that exist.
+    """
+
+    def __init__(self, output: Path, *, overwrite: bool = False) -> None:
+        super().__init__(output, overwrite=overwrite)
+        head = f'{{"info": {dumps({"description": "Written by trilitenet", "version": "1.0"})},\n"annotations": ['
+        self._stream: JsonStream | None = JsonStream(self.create("coco.json"), head)
+        self._images: list[dict[str, Any]] = []
+        self._class_names: tuple[str, ...] = ()
+        self._annotations = 0
+
+    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+        """Write the annotations of one image."""
+        height, width = perception.size
+        self._class_names = perception.class_names
+        image_id = len(self._images) + 1
+        image = {"id": image_id, "file_name": self.image_name(perception), "width": width, "height": height}
+        self._images.append(image)
+        boxes = perception.boxes
+        for index in range(0 if boxes is None else len(boxes)):
+            assert boxes is not None
+            left, top, right, bottom = rounded(boxes.xyxy[index])
+            sides = [round(right - left, 2), round(bottom - top, 2)]
+            annotation: dict[str, Any] = {
+                "category_id": int(boxes.class_id[index]) + 1,
+                "bbox": [left, top, *sides],
+                "area": round(sides[0] * sides[1], 2),
+                "segmentation": [],
+                "score": round(float(boxes.confidence[index]), 4),
+            }
+            if boxes.track_id is not None and boxes.track_id[index] >= 0:
+                annotation["track_id"] = int(boxes.track_id[index])
+            self._add(image_id, annotation)
+        for place, mask in enumerate((perception.drivable, perception.lane), start=1):
+            if mask is None or not mask.any():
+                continue
+            rows, columns = mask.any(axis=1).nonzero()[0], mask.any(axis=0).nonzero()[0]
+            left, top = int(columns[0]), int(rows[0])
+            self._add(
+                image_id,
+                {
+                    "category_id": len(self._class_names) + place,
+                    "bbox": [left, top, int(columns[-1]) + 1 - left, int(rows[-1]) + 1 - top],
+                    "area": int(mask.sum()),
+                    "segmentation": encode_mask(mask),
+                },
+            )
+
+    def close(self) -> None:
+        """Write the images and categories, and finish the file."""
+        if self._stream is None:
+            return
+        categories = [
+            *({"name": name, "supercategory": "object", "isthing": 1} for name in self._class_names),
+            {"name": "drivable", "supercategory": "road", "isthing": 0},
+            {"name": "lane", "supercategory": "road", "isthing": 0},
+        ]
+        numbered = [{"id": number, **category} for number, category in enumerate(categories, start=1)]
+        images = ",\n".join(dumps(image) for image in self._images)
+        self._stream.close(f'],\n"images": [\n{images}\n],\n"categories": {dumps(numbered)}}}')
+        self.finish(self._stream.partial, self._stream.path)
+        self._stream = None
+
+    def _add(self, image_id: int, annotation: dict[str, Any]) -> None:
+        assert self._stream is not None
+        self._annotations += 1
+        self._stream.add({"id": self._annotations, "image_id": image_id, "iscrowd": 0, **annotation})

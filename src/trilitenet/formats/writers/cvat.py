@@ -1,0 +1,230 @@
+"""CVAT's XML, version 1.1: upload it to a task and correct there what the network drew.
+
+Formats: https://docs.cvat.ai/docs/dataset_management/formats/format-cvat/. Still images become one file of the kind
+*CVAT for images*, with masks as masks; each video becomes one of the kind *CVAT for video*, where CVAT knows no masks
+and the areas are polygons. A task needs the labels listed under ``meta``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import IO, Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.formats.writers.base import Writer
+from trilitenet.processing.polygons import mask_to_polygons
+from trilitenet.structures import Perception
+
+__all__ = ["CvatWriter", "cvat_mask"]
+
+_HEAD = '<?xml version="1.0" encoding="utf-8"?>\n<annotations>\n  <version>1.1</version>\n'
+
+
+class CvatWriter(Writer):
+    """Writes ``cvat-images.xml`` for the still images and ``NAME.cvat-video.xml`` for each video.
+
+    CVAT lists a video by track, not by frame, so the shapes of one video are held until it ends: about 2 KB a frame.
+
+    Args:
+        output: The folder.
+        overwrite: Replace files that exist.
+        tolerance: A polygon leaves the mask's outline by at most so many pixels.
+    """
+
+    def __init__(self, output: Path, *, overwrite: bool = False, tolerance: float = 1.0) -> None:
+        super().__init__(output, overwrite=overwrite)
+        self.tolerance = tolerance
+        self._images: _ImagesFile | None = None
+        self._video: _VideoFile | None = None
+
+    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+        """Write one image, or keep one frame of a video."""
+        if perception.frame is None:
+            self._close_video()
+            if self._images is None:
+                self._images = _ImagesFile(self.create("cvat-images.xml"), perception)
+            self._images.add(perception, self.image_name(perception))
+            return
+        if self._video is None or self._video.source != perception.source:
+            self._close_video()
+            self._video = _VideoFile(self.create(f"{self.stem(perception)}.cvat-video.xml"), perception)
+        self._video.add(perception, self.tolerance)
+
+    def close(self) -> None:
+        """Finish the files."""
+        self._close_video()
+        if self._images is not None:
+            self._images.close()
+            self.finish(self._images.partial, self._images.path)
+            self._images = None
+
+    def _close_video(self) -> None:
+        if self._video is not None:
+            partial = _partial(self._video.path)
+            with partial.open("w", encoding="utf-8") as handle:
+                self._video.dump(handle)
+            self.finish(partial, self._video.path)
+            self._video = None
+
+
+def cvat_mask(mask: NDArray[np.bool_]) -> tuple[str, int, int, int, int] | None:
+    """Encode a mask as CVAT does.
+
+    Args:
+        mask: (H, W) bool.
+
+    Returns:
+        Run lengths within the bounding box (row by row, the first run is background), and its left, top, width and
+        height in pixels; None for an empty mask.
+    """
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return None
+    top, left = int(rows[0]), int(columns[0])
+    inside = mask[top : rows[-1] + 1, left : columns[-1] + 1]
+    flat = inside.reshape(-1)
+    edges = np.flatnonzero(flat[1:] != flat[:-1]) + 1
+    runs = np.diff(np.concatenate([[0], edges, [len(flat)]]))
+    text = ", ".join(str(run) for run in ([0, *runs] if flat[0] else runs))
+    return text, left, top, inside.shape[1], inside.shape[0]
+
+
+def _partial(path: Path) -> Path:
+    return path.with_name(f"{path.name}.part")
+
+
+def _labels(perception: Perception) -> str:
+    """Return the labels a task needs, as CVAT's ``meta`` lists them."""
+    names = [*perception.class_names, "drivable", "lane"]
+    label = (
+        "        <label><name>{}</name><type>any</type><attributes><attribute><name>confidence</name>"
+        "<mutable>True</mutable><input_type>text</input_type><default_value></default_value><values></values>"
+        "</attribute></attributes></label>\n"
+    )
+    return "      <labels>\n" + "".join(label.format(_text(name)) for name in names) + "      </labels>\n"
+
+
+def _text(value: str) -> str:
+    return value.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+
+
+def _corners(box: NDArray[np.float32]) -> str:
+    return 'xtl="{:.2f}" ytl="{:.2f}" xbr="{:.2f}" ybr="{:.2f}"'.format(*box.tolist())
+
+
+def _confidence(score: float) -> str:
+    return f'<attribute name="confidence">{score:.3f}</attribute>'
+
+
+class _ImagesFile:
+    """A file of the kind *CVAT for images*, written as it comes."""
+
+    def __init__(self, path: Path, first: Perception) -> None:
+        self.path = path
+        self.partial = _partial(path)
+        self.count = 0
+        self._handle: IO[str] = self.partial.open("w", encoding="utf-8")
+        self._handle.write(f"{_HEAD}  <meta>\n    <task>\n{_labels(first)}    </task>\n  </meta>\n")
+
+    def add(self, perception: Perception, name: str) -> None:
+        height, width = perception.size
+        write = self._handle.write
+        write(f'  <image id="{self.count}" name={quoteattr(name)} width="{width}" height="{height}">\n')
+        for label, mask in (("drivable", perception.drivable), ("lane", perception.lane)):
+            encoded = None if mask is None else cvat_mask(mask)
+            if encoded is not None:
+                runs, left, top, mask_width, mask_height = encoded
+                write(
+                    f'    <mask label="{label}" source="auto" occluded="0" rle="{runs}" left="{left}" top="{top}" '
+                    f'width="{mask_width}" height="{mask_height}" z_order="0"></mask>\n'
+                )
+        if perception.boxes is not None:
+            for box, score, class_id in zip(
+                perception.boxes.xyxy, perception.boxes.confidence, perception.boxes.class_id, strict=True
+            ):
+                write(
+                    f'    <box label={quoteattr(perception.class_names[class_id])} source="auto" occluded="0" '
+                    f'{_corners(box)} z_order="1">{_confidence(float(score))}</box>\n'
+                )
+        write("  </image>\n")
+        self.count += 1
+
+    def close(self) -> None:
+        with self._handle as handle:
+            handle.write("</annotations>\n")
+
+
+@dataclasses.dataclass
+class _Track:
+    """One ``<track>``: what is inside each shape, by frame."""
+
+    label: str
+    shape: str
+    shapes: dict[int, tuple[str, str]] = dataclasses.field(default_factory=dict)
+
+    def lines(self, following: Mapping[int, int]) -> Iterator[str]:
+        """Yield the shapes; in the frame where the track is gone, one marked ``outside`` hides it."""
+        for frame, (attributes, inside) in self.shapes.items():
+            yield self._line(frame, attributes, inside, outside=0)
+            after = following.get(frame)
+            if after is not None and after not in self.shapes:
+                yield self._line(after, attributes, inside, outside=1)
+
+    def _line(self, frame: int, attributes: str, inside: str, outside: int) -> str:
+        return (
+            f'    <{self.shape} frame="{frame}" keyframe="1" outside="{outside}" occluded="0" {attributes} '
+            f'z_order="{int(self.shape == "box")}">{inside}</{self.shape}>\n'
+        )
+
+
+class _VideoFile:
+    """A file of the kind *CVAT for video*: shapes are gathered by track, and written at the end.
+
+    The n-th largest region of each frame makes the n-th track of its label; a box without identity is a track of one
+    frame.
+    """
+
+    def __init__(self, path: Path, first: Perception) -> None:
+        self.path = path
+        self.source = first.source
+        self._first = first
+        self._frames: list[int] = []
+        self._tracks: dict[object, _Track] = {}
+
+    def add(self, perception: Perception, tolerance: float) -> None:
+        frame = perception.frame or 0
+        self._frames.append(frame)
+        for label, mask in (("drivable", perception.drivable), ("lane", perception.lane)):
+            polygons = [] if mask is None else mask_to_polygons(mask, tolerance=tolerance)
+            for rank, polygon in enumerate(polygons):
+                points = ";".join(f"{x:.2f},{y:.2f}" for x, y in (polygon + 0.5).tolist())
+                track = self._tracks.setdefault((label, rank), _Track(label, "polygon"))
+                track.shapes[frame] = (f'points="{points}"', "")
+        boxes = perception.boxes
+        for index in range(0 if boxes is None else len(boxes)):
+            assert boxes is not None
+            label = perception.class_names[boxes.class_id[index]]
+            identity = -1 if boxes.track_id is None else int(boxes.track_id[index])
+            key: object = ("box", label, identity) if identity >= 0 else ("box", frame, index)
+            track = self._tracks.setdefault(key, _Track(label, "box"))
+            track.shapes[frame] = (_corners(boxes.xyxy[index]), _confidence(float(boxes.confidence[index])))
+
+    def dump(self, handle: IO[str]) -> None:
+        height, width = self._first.size
+        last = self._frames[-1]
+        following = dict(zip(self._frames, self._frames[1:], strict=False))
+        handle.write(f"{_HEAD}  <meta>\n    <task>\n      <size>{last + 1}</size>\n")
+        handle.write("      <mode>interpolation</mode>\n      <start_frame>0</start_frame>\n")
+        handle.write(f"      <stop_frame>{last}</stop_frame>\n{_labels(self._first)}")
+        handle.write(f"      <original_size><width>{width}</width><height>{height}</height></original_size>\n")
+        handle.write("    </task>\n  </meta>\n")
+        for number, track in enumerate(self._tracks.values()):
+            handle.write(f'  <track id="{number}" label={quoteattr(track.label)} source="auto">\n')
+            handle.writelines(track.lines(following))
+            handle.write("  </track>\n")
+        handle.write("</annotations>\n")

@@ -1,0 +1,132 @@
+"""ASAM OpenLABEL 1.0: one JSON a picture or video, objects by identity and what is known of them by frame.
+
+Standard: https://www.asam.net/standards/detail/openlabel/. Boxes are ``bbox`` (centre x, centre y, width, height in
+pixels), the two masks are ``image`` (PNG in base64, 255 = inside), and their objects have the uids 0 and 1.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.formats.writers.base import JsonStream, Writer, dumps, rounded
+from trilitenet.processing.boxes import xyxy_to_cxcywh
+from trilitenet.structures import Perception
+
+__all__ = ["OpenLabelWriter"]
+
+_MASKS: Final = (("0", "drivable", "drivable area"), ("1", "lane", "lane marking"))
+_METADATA: Final = {"schema_version": "1.0.0", "annotator": "trilitenet"}
+
+
+class OpenLabelWriter(Writer):
+    """Writes ``NAME.openlabel.json`` for each picture and each video.
+
+    The list of objects is held until a video ends: about 200 bytes an object.
+
+    Args:
+        output: The folder.
+        overwrite: Replace files that exist.
+    """
+
+    def __init__(self, output: Path, *, overwrite: bool = False) -> None:
+        super().__init__(output, overwrite=overwrite)
+        self._document: _Document | None = None
+
+    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+        """Write one picture or frame."""
+        document = self._document
+        if document is None or perception.frame is None or document.source != perception.source:
+            self.close()
+            path = self.create(f"{self.stem(perception)}.openlabel.json")
+            self._document = document = _Document(path, perception.source)
+        document.add(perception)
+
+    def close(self) -> None:
+        """Finish the file of the last picture or video."""
+        if self._document is not None:
+            self._document.close()
+            self.finish(self._document.stream.partial, self._document.stream.path)
+            self._document = None
+
+
+class _Document:
+    def __init__(self, path: Path, source: str | None) -> None:
+        self.source = source
+        metadata = {**_METADATA, **({"tagged_file": source} if source else {})}
+        camera = {"type": "camera", "description": "front camera", **({"uri": source} if source else {})}
+        head = f'{{"openlabel": {{"metadata": {dumps(metadata)},\n"streams": {dumps({"camera": camera})},\n"frames": {{'
+        self.stream = JsonStream(path, head)
+        self._objects: dict[str, dict[str, str]] = {}
+        self._seen: dict[str, list[int]] = {}
+        self._frames: list[int] = []
+        self._uids: dict[int, str] = {}
+        self._next = len(_MASKS)
+
+    def add(self, perception: Perception) -> None:
+        frame = perception.frame or 0
+        self._frames.append(frame)
+        objects: dict[str, Any] = {}
+        for uid, task, label in _MASKS:
+            mask = getattr(perception, task)
+            if mask is not None:
+                self._register(uid, frame, label, label)
+                objects[uid] = {"object_data": {"image": [_image("mask", mask)]}}
+        boxes = perception.boxes
+        for index in range(0 if boxes is None else len(boxes)):
+            assert boxes is not None
+            uid = self._uid(-1 if boxes.track_id is None else int(boxes.track_id[index]))
+            kind = perception.class_names[boxes.class_id[index]]
+            self._register(uid, frame, f"{kind} {uid}", kind)
+            confidence = {"name": "confidence", "val": round(float(boxes.confidence[index]), 4)}
+            value = list(rounded(xyxy_to_cxcywh(boxes.xyxy[index])))
+            box = {"name": "box", "val": value, "attributes": {"num": [confidence]}}
+            objects[uid] = {"object_data": {"bbox": [box]}}
+        content: dict[str, Any] = {"objects": objects}
+        if perception.timestamp is not None:
+            content["frame_properties"] = {"timestamp": round(perception.timestamp, 6)}
+        self.stream.add(content, key=str(frame))
+
+    def close(self) -> None:
+        objects = {
+            uid: {**named, "frame_intervals": _intervals(self._seen[uid])} for uid, named in self._objects.items()
+        }
+        intervals = dumps(_intervals(self._frames))
+        self.stream.close(f'}},\n"objects": {dumps(objects)},\n"frame_intervals": {intervals}}}}}')
+
+    def _uid(self, track_id: int) -> str:
+        """Return the uid of a track, or a new one for a box without identity."""
+        if track_id in self._uids:
+            return self._uids[track_id]
+        uid = str(self._next)
+        self._next += 1
+        if track_id >= 0:
+            self._uids[track_id] = uid
+        return uid
+
+    def _register(self, uid: str, frame: int, name: str, kind: str) -> None:
+        self._objects.setdefault(uid, {"name": name, "type": kind})
+        self._seen.setdefault(uid, []).append(frame)
+
+
+def _image(name: str, mask: NDArray[np.bool_]) -> dict[str, str]:
+    _, encoded = cv2.imencode(".png", mask.astype(np.uint8) * 255, [cv2.IMWRITE_PNG_BILEVEL, 1])
+    value = base64.b64encode(encoded.tobytes()).decode("ascii")
+    return {"name": name, "val": value, "mime_type": "image/png", "encoding": "base64"}
+
+
+def _intervals(frames: list[int]) -> list[dict[str, int]]:
+    """Gather ascending frame numbers into closed intervals."""
+    intervals: list[dict[str, int]] = []
+    for frame in frames:
+        if intervals and frame == intervals[-1]["frame_end"] + 1:
+            intervals[-1]["frame_end"] = frame
+        elif not intervals or frame != intervals[-1]["frame_end"]:
+            intervals.append({"frame_start": frame, "frame_end": frame})
+    return intervals

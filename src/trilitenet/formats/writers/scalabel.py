@@ -1,0 +1,97 @@
+"""Scalabel's JSON, the format of BDD100K's labels since 2020.
+
+Format: https://doc.scalabel.com/format.html.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from trilitenet.formats.writers.base import JsonStream, Writer, dumps, rounded
+from trilitenet.processing.serialise import encode_mask
+from trilitenet.structures import Perception
+
+__all__ = ["ScalabelWriter"]
+
+
+class ScalabelWriter(Writer):
+    """Writes ``scalabel.json``: frames with boxes, and drivable area and lane markings as run-length masks.
+
+    Args:
+        output: The folder.
+        overwrite: Replace files that exist.
+    """
+
+    def __init__(self, output: Path, *, overwrite: bool = False) -> None:
+        super().__init__(output, overwrite=overwrite)
+        self._stream: JsonStream | None = JsonStream(self.create("scalabel.json"), '{"frames": [')
+        self._class_names: tuple[str, ...] = ()
+        self._labels = 0
+
+    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+        """Write one frame."""
+        assert self._stream is not None
+        self._class_names = perception.class_names
+        height, width = perception.size
+        frame: dict[str, Any] = {
+            "name": self.image_name(perception),
+            "url": perception.source,
+            "size": {"width": width, "height": height},
+            "labels": [*self._boxes(perception), *self._masks(perception)],
+        }
+        if perception.frame is not None:
+            frame |= {"videoName": self.stem(perception), "frameIndex": perception.frame}
+        if perception.timestamp is not None:
+            frame["timestamp"] = round(perception.timestamp * 1000)  # milliseconds
+        self._stream.add(frame)
+
+    def close(self) -> None:
+        """Write the categories, and finish the file."""
+        if self._stream is None:
+            return
+        categories = [
+            *({"name": name, "isThing": True} for name in self._class_names),
+            {"name": "drivable", "isThing": False},
+            {"name": "lane", "isThing": False},
+        ]
+        self._stream.close(f'],\n"groups": null,\n"config": {dumps({"categories": categories})}}}')
+        self.finish(self._stream.partial, self._stream.path)
+        self._stream = None
+
+    def _boxes(self, perception: Perception) -> list[dict[str, Any]]:
+        boxes = perception.boxes
+        labels = []
+        for index in range(0 if boxes is None else len(boxes)):
+            assert boxes is not None
+            tracked = boxes.track_id is not None and boxes.track_id[index] >= 0
+            identity = f"track-{boxes.track_id[index]}" if boxes.track_id is not None and tracked else self._identity()
+            labels.append(
+                {
+                    "id": identity,
+                    "category": perception.class_names[boxes.class_id[index]],
+                    "score": round(float(boxes.confidence[index]), 4),
+                    "manualShape": False,
+                    "manualAttributes": False,
+                    "box2d": dict(zip(("x1", "y1", "x2", "y2"), rounded(boxes.xyxy[index]), strict=True)),
+                }
+            )
+        return labels
+
+    def _masks(self, perception: Perception) -> list[dict[str, Any]]:
+        return [
+            {
+                "id": self._identity(),
+                "category": category,
+                "manualShape": False,
+                "manualAttributes": False,
+                "rle": encode_mask(mask),
+            }
+            for category, mask in (("drivable", perception.drivable), ("lane", perception.lane))
+            if mask is not None and mask.any()
+        ]
+
+    def _identity(self) -> str:
+        self._labels += 1
+        return str(self._labels)

@@ -1,0 +1,173 @@
+"""Tables for statistics over many frames: CSV to open anywhere, Parquet for fleets."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any, Final
+
+from trilitenet.errors import import_extra
+from trilitenet.formats.writers.base import Writer, rounded
+from trilitenet.processing.serialise import encode_mask
+from trilitenet.structures import SCHEMA_VERSION, Perception
+
+__all__ = ["BOX_COLUMNS", "FRAME_COLUMNS", "CsvWriter", "ParquetWriter", "box_rows", "frame_row"]
+
+ROW_GROUP: Final = 256
+"""Frames a row group of Parquet; so many are held in memory."""
+
+_WHERE: Final = {"source": str, "frame": int, "timestamp": float}
+FRAME_COLUMNS: Final[dict[str, type]] = {
+    **_WHERE,
+    "width": int,
+    "height": int,
+    "objects": int,
+    "drivable_share": float,
+    "lane_share": float,
+}
+"""Columns of a row a frame."""
+BOX_COLUMNS: Final[dict[str, type]] = {
+    **_WHERE,
+    "class_name": str,
+    "track_id": int,
+    "confidence": float,
+    "left": float,
+    "top": float,
+    "right": float,
+    "bottom": float,
+}
+"""Columns of a row an object; corners in pixels of the source image."""
+
+
+def frame_row(perception: Perception, road: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the figures of one frame that have a single value; None where there is none.
+
+    ``drivable_share`` and ``lane_share`` are the masks' shares of the image's pixels.
+    """
+    height, width = perception.size
+    return {
+        "source": perception.source,
+        "frame": perception.frame,
+        "timestamp": perception.timestamp,
+        "width": width,
+        "height": height,
+        "objects": None if perception.boxes is None else len(perception.boxes),
+        "drivable_share": None if perception.drivable is None else round(float(perception.drivable.mean()), 6),
+        "lane_share": None if perception.lane is None else round(float(perception.lane.mean()), 6),
+    }
+
+
+def box_rows(perception: Perception) -> list[dict[str, Any]]:
+    """Return a row an object, best first; ``track_id`` is None where the identity is unknown."""
+    boxes = perception.boxes
+    if boxes is None:
+        return []
+    tracks = [-1] * len(boxes) if boxes.track_id is None else boxes.track_id.tolist()
+    return [
+        {
+            "class_name": perception.class_names[class_id],
+            "track_id": track if track >= 0 else None,
+            "confidence": round(score, 4),
+            **dict(zip(("left", "top", "right", "bottom"), rounded(corners), strict=True)),
+        }
+        for corners, score, class_id, track in zip(
+            boxes.xyxy.tolist(), boxes.confidence.tolist(), boxes.class_id.tolist(), tracks, strict=True
+        )
+    ]
+
+
+class CsvWriter(Writer):
+    """Writes ``frames.csv``, a row a frame, and ``boxes.csv``, a row an object; both are readable while they grow.
+
+    Args:
+        output: The folder.
+        overwrite: Replace files that exist.
+    """
+
+    def __init__(self, output: Path, *, overwrite: bool = False) -> None:
+        super().__init__(output, overwrite=overwrite)
+        paths = [self.create("frames.csv"), self.create("boxes.csv")]
+        self._handles: list[IO[str]] = [path.open("w", encoding="utf-8", newline="", buffering=1) for path in paths]
+        self.files.extend(paths)
+        self._frames = csv.DictWriter(self._handles[0], list(FRAME_COLUMNS))
+        self._boxes = csv.DictWriter(self._handles[1], list(BOX_COLUMNS))
+        self._frames.writeheader()
+        self._boxes.writeheader()
+
+    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+        """Write the rows of one frame."""
+        self._frames.writerow(frame_row(perception, road))
+        where = {"source": perception.source, "frame": perception.frame, "timestamp": perception.timestamp}
+        for row in box_rows(perception):
+            self._boxes.writerow({**where, **row})
+
+    def close(self) -> None:
+        """Close the files."""
+        for handle in self._handles:
+            handle.close()
+
+
+class ParquetWriter(Writer):
+    """Writes ``perceptions.parquet``: a row a frame, with a list of boxes, the masks as run-length text and the road.
+
+    Args:
+        output: The folder.
+        overwrite: Replace files that exist.
+
+    Raises:
+        MissingExtraError: If pyarrow is not installed.
+    """
+
+    def __init__(self, output: Path, *, overwrite: bool = False) -> None:
+        self._arrow = import_extra("pyarrow", "parquet")
+        parquet = import_extra("pyarrow.parquet", "parquet")
+        super().__init__(output, overwrite=overwrite)
+        arrow = self._arrow
+        number, integer, text = arrow.float64(), arrow.int64(), arrow.string()
+        kinds = {str: text, int: integer, float: number}
+        box = arrow.struct([(name, kinds[kind]) for name, kind in BOX_COLUMNS.items() if name not in _WHERE])
+        self._schema = arrow.schema(
+            [
+                *((name, kinds[kind]) for name, kind in FRAME_COLUMNS.items()),
+                ("boxes", arrow.list_(box)),
+                ("drivable", text),
+                ("lane", text),
+                ("road", text),
+            ],
+            metadata={"trilitenet.schema": SCHEMA_VERSION},
+        )
+        self._path = self.create("perceptions.parquet")
+        self._partial = self._path.with_name(f"{self._path.name}.part")
+        self._file = parquet.ParquetWriter(self._partial, self._schema, compression="zstd")
+        self._rows: list[dict[str, Any]] = []
+        self._open = True
+
+    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+        """Write the row of one frame."""
+        self._rows.append(
+            {
+                **frame_row(perception, road),
+                "boxes": None if perception.boxes is None else box_rows(perception),
+                "drivable": None if perception.drivable is None else encode_mask(perception.drivable)["counts"],
+                "lane": None if perception.lane is None else encode_mask(perception.lane)["counts"],
+                "road": None if road is None else json.dumps(dict(road), allow_nan=False),
+            }
+        )
+        if len(self._rows) >= ROW_GROUP:
+            self._flush()
+
+    def close(self) -> None:
+        """Write what is left, and finish the file."""
+        if not self._open:
+            return
+        self._open = False
+        self._flush()
+        self._file.close()
+        self.finish(self._partial, self._path)
+
+    def _flush(self) -> None:
+        if self._rows:
+            self._file.write_table(self._arrow.Table.from_pylist(self._rows, schema=self._schema))
+            self._rows = []

@@ -1,0 +1,59 @@
+"""YOLO's label files: a text file an image, a line a box: class, centre x, centre y, width, height, all in [0, 1].
+
+Format: https://docs.ultralytics.com/datasets/detect/. Only boxes have a place in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from trilitenet.formats.writers.base import Writer
+from trilitenet.processing.boxes import xyxy_to_cxcywh
+from trilitenet.structures import Perception
+
+__all__ = ["YoloWriter"]
+
+
+class YoloWriter(Writer):
+    """Writes ``labels/NAME.txt`` for each image, and one ``data.yaml`` with the class names.
+
+    Args:
+        output: The folder; the images belong into ``images`` beside ``labels``.
+        overwrite: Replace files that exist.
+        confidence: Add the confidence as a sixth column, as YOLO's own predictions can have; tools that read labels
+            take five.
+    """
+
+    def __init__(self, output: Path, *, overwrite: bool = False, confidence: bool = False) -> None:
+        super().__init__(output, overwrite=overwrite)
+        self.confidence = confidence
+        self._class_names: tuple[str, ...] | None = None
+        self._data = self.create("data.yaml")
+
+    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+        """Write the label file of one image; it is empty when there is no box."""
+        number = "" if perception.frame is None else f"-{perception.frame:07d}"
+        path = self.create(f"labels/{self.stem(perception)}{number}.txt")
+        lines = []
+        if perception.boxes is not None:
+            height, width = perception.size
+            boxes = xyxy_to_cxcywh(perception.boxes.xyxy) / np.array([width, height, width, height], np.float32)
+            for box, class_id, score in zip(boxes, perception.boxes.class_id, perception.boxes.confidence, strict=True):
+                values = " ".join(f"{value:.6f}" for value in box)
+                lines.append(f"{class_id} {values}" + (f" {score:.4f}" if self.confidence else "") + "\n")
+        path.write_text("".join(lines), encoding="utf-8")
+        self.files.append(path)
+        self._class_names = perception.class_names
+
+    def close(self) -> None:
+        """Write ``data.yaml``."""
+        if self._class_names is None or self._data in self.files:
+            return
+        data = {"path": ".", "train": "images", "val": "images", "names": list(self._class_names)}
+        self._data.write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
+        self.files.append(self._data)

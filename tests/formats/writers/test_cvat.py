@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trilitenet.formats.writers.cvat import CvatWriter, cvat_mask
+from trilitenet.structures import Perception
+
+xmlschema = pytest.importorskip("xmlschema")
+SCHEMA = Path(__file__).with_name("cvat-1.1.xsd")
+
+
+def write(output: Path, perceptions: list[Perception]) -> ElementTree.Element:
+    with CvatWriter(output) as writer:
+        for perception in perceptions:
+            writer.write(perception)
+    (path,) = writer.files
+    xmlschema.XMLSchema(SCHEMA).validate(path)
+    return ElementTree.parse(path).getroot()
+
+
+def decode(node: ElementTree.Element, size: tuple[int, int]) -> np.ndarray:
+    """Decode CVAT's mask as CVAT's documentation describes it."""
+    left, top, width, height = (int(node.attrib[name]) for name in ("left", "top", "width", "height"))
+    inside: list[int] = []
+    for index, run in enumerate(node.attrib["rle"].split(",")):
+        inside += [index % 2] * int(run)
+    mask = np.zeros(size, np.bool_)
+    mask[top : top + height, left : left + width] = np.array(inside, np.bool_).reshape(height, width)
+    return mask
+
+
+def test_pictures(tmp_path: Path, pictures: list[Perception]) -> None:
+    images = write(tmp_path, pictures).findall("image")
+    assert [image.get("name") for image in images] == ["road.jpg", "night/road.jpg"]
+    assert [box.get("label") for box in images[0].findall("box")] == ["vehicle", "rider & bike"]
+    assert images[0].findall("box")[0].get("xtl") == "10.25"
+    assert [mask.get("label") for mask in images[0].findall("mask")] == ["drivable", "lane"]
+    for node, mask in zip(images[0].findall("mask"), (pictures[0].drivable, pictures[0].lane), strict=True):
+        np.testing.assert_array_equal(decode(node, pictures[0].size), mask)
+    assert len(images[1]) == 0
+
+
+def test_video_ends_tracks_where_they_end(tmp_path: Path, video: list[Perception]) -> None:
+    root = write(tmp_path, video)
+    tracks = root.findall("track")
+    vehicle = next(track for track in tracks if track.get("label") == "vehicle")
+    assert [(box.get("frame"), box.get("outside")) for box in vehicle] == [
+        ("0", "0"),
+        ("1", "0"),
+        ("2", "1"),
+        ("3", "0"),
+    ]
+    riders = [track for track in tracks if track.get("label") == "rider & bike"]
+    assert len(riders) == 4, "a box without identity is a track of its own"
+    lanes = [track for track in tracks if track.get("label") == "lane"]
+    assert len(lanes) == 2
+    assert [(shape.get("frame"), shape.get("outside")) for shape in lanes[0]][-1] == ("3", "1")
+    assert root.findtext("meta/task/size") == "4"
+
+
+def test_skipped_frames_do_not_hide_a_track(tmp_path: Path, video: list[Perception]) -> None:
+    vehicle = next(t for t in write(tmp_path, [video[0], video[3]]).findall("track") if t.get("label") == "vehicle")
+    assert [(box.get("frame"), box.get("outside")) for box in vehicle] == [("0", "0"), ("3", "0")]
+
+
+def test_mask_runs_by_hand() -> None:
+    mask = np.array([[0, 0, 0, 0], [0, 0, 1, 1], [0, 1, 1, 0]], np.bool_)
+    assert cvat_mask(mask) == ("1, 4, 1", 1, 1, 3, 2)
+    assert cvat_mask(np.ones((2, 2), np.bool_)) == ("0, 4", 0, 0, 2, 2)
+    assert cvat_mask(np.zeros((2, 2), np.bool_)) is None
+
+
+def test_datumaro_opens_it(tmp_path: Path, pictures: list[Perception]) -> None:
+    datumaro = pytest.importorskip("datumaro")
+    write(tmp_path, pictures)
+    dataset = datumaro.Dataset.import_from(str(tmp_path), "cvat")
+    items = {item.id: item for item in dataset}
+    assert len(items) == 2
+    kinds = sorted(annotation.type.name for annotation in items["road"].annotations)
+    assert kinds == ["bbox", "bbox", "mask", "mask"]

@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+import base64
+import json
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jsonschema
+import numpy as np
+import pytest
+
+from trilitenet.formats.writers.openlabel import OpenLabelWriter
+from trilitenet.structures import Perception
+
+
+def write(output: Path, perceptions: list[Perception]) -> list[dict[str, Any]]:
+    with OpenLabelWriter(output) as writer:
+        for perception in perceptions:
+            writer.write(perception)
+    return [json.loads(path.read_text(encoding="utf-8")) for path in writer.files]
+
+
+def test_the_standards_own_schema_accepts_it(
+    tmp_path: Path, pictures: list[Perception], video: list[Perception]
+) -> None:
+    package = pytest.importorskip("uai_openlabel")
+    file = resources.files(package).joinpath("official_schema").joinpath("openlabel_json_schema.json")
+    validator = jsonschema.Draft7Validator(json.loads(file.read_text(encoding="utf-8")))
+    documents = write(tmp_path, [*pictures, *video])
+    assert len(documents) == 3
+    for document in documents:
+        validator.validate(document)
+        package.OpenLabel.from_dict(document)
+    broken = json.loads(json.dumps(documents[0]).replace('"mime_type"', '"mime"'))
+    assert not validator.is_valid(broken), "the schema can refuse"
+
+
+def test_boxes_and_masks_come_back(tmp_path: Path, pictures: list[Perception]) -> None:
+    content = write(tmp_path, pictures[:1])[0]["openlabel"]
+    objects = content["frames"]["0"]["objects"]
+    box = objects["2"]["object_data"]["bbox"][0]
+    assert box["val"] == pytest.approx([35.125, 35.25, 49.75, 30.5], abs=0.01)
+    assert box["attributes"]["num"] == [{"name": "confidence", "val": 0.9}]
+    image = objects["0"]["object_data"]["image"][0]
+    mask = cv2.imdecode(np.frombuffer(base64.b64decode(image["val"]), np.uint8), cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_array_equal(mask == 255, pictures[0].drivable)
+    assert content["streams"]["camera"]["uri"] == "day/road.jpg"
+
+
+def test_objects_say_when_they_were_seen(tmp_path: Path, video: list[Perception]) -> None:
+    content = write(tmp_path, video)[0]["openlabel"]
+    vehicles = [thing for thing in content["objects"].values() if thing["type"] == "vehicle"]
+    assert [vehicle["frame_intervals"] for vehicle in vehicles] == [
+        [{"frame_start": 0, "frame_end": 1}, {"frame_start": 3, "frame_end": 3}]
+    ]
+    assert len([thing for thing in content["objects"].values() if thing["type"] == "rider & bike"]) == 4
+    assert content["objects"]["1"]["frame_intervals"] == [{"frame_start": 0, "frame_end": 2}]
+    assert content["frame_intervals"] == [{"frame_start": 0, "frame_end": 3}]
+    assert content["frames"]["3"]["frame_properties"]["timestamp"] == 0.12

@@ -1,0 +1,48 @@
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trilitenet.formats.writers.tables import BOX_COLUMNS, FRAME_COLUMNS, CsvWriter, ParquetWriter
+from trilitenet.processing.serialise import decode_mask
+from trilitenet.structures import Perception
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as handle:
+        return list(csv.DictReader(handle))
+
+
+def test_csv(tmp_path: Path, video: list[Perception]) -> None:
+    with CsvWriter(tmp_path) as writer:
+        for frame in video:
+            writer.write(frame)
+    assert video[0].drivable is not None
+    frames, boxes = read(tmp_path / "frames.csv"), read(tmp_path / "boxes.csv")
+    assert list(frames[0]) == list(FRAME_COLUMNS)
+    assert list(boxes[0]) == list(BOX_COLUMNS)
+    assert [row["objects"] for row in frames] == ["2", "2", "1", "2"]
+    assert float(frames[0]["drivable_share"]) == pytest.approx(np.mean(video[0].drivable), abs=1e-6)
+    assert frames[3]["lane_share"] == "", "a task that the model lacks is empty, not 0"
+    assert [row["track_id"] for row in boxes[:2]] == ["7", ""]
+    assert boxes[0]["right"] == "60.0"
+
+
+def test_parquet(tmp_path: Path, video: list[Perception]) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    with ParquetWriter(tmp_path) as writer:
+        for frame in video * 100:
+            writer.write(frame)
+    table = parquet.read_table(tmp_path / "perceptions.parquet")
+    assert table.num_rows == 400
+    assert parquet.ParquetFile(tmp_path / "perceptions.parquet").num_row_groups == 2
+    row = table.slice(1, 1).to_pylist()[0]
+    assert row["frame"] == 1
+    assert row["boxes"][0]["track_id"] == 7
+    assert row["boxes"][1]["track_id"] is None
+    mask = decode_mask({"size": [row["height"], row["width"]], "counts": row["drivable"]})
+    np.testing.assert_array_equal(mask, video[1].drivable)
+    assert table.slice(3, 1).to_pylist()[0]["lane"] is None

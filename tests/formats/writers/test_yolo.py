@@ -1,0 +1,42 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from trilitenet.formats.writers.yolo import YoloWriter
+from trilitenet.structures import Perception
+
+
+def test_lines_by_hand(tmp_path: Path, pictures: list[Perception]) -> None:
+    with YoloWriter(tmp_path, confidence=True) as writer:
+        writer.write(pictures[0])
+    lines = (tmp_path / "labels" / "road.txt").read_text().splitlines()
+    # centre x (10.25 + 60) / 2 / 200, centre y (20 + 50.5) / 2 / 120, width 49.75 / 200, height 30.5 / 120
+    assert lines[0] == "0 0.175625 0.293750 0.248750 0.254167 0.9000"
+    assert lines[1].startswith("1 0.575000 ")
+
+
+def test_supervision_opens_it(tmp_path: Path, pictures: list[Perception]) -> None:
+    supervision = pytest.importorskip("supervision")
+    with YoloWriter(tmp_path) as writer:
+        writer.write(pictures[0])
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "road.jpg"), np.zeros((*pictures[0].size, 3), np.uint8))
+    dataset = supervision.DetectionDataset.from_yolo(
+        str(tmp_path / "images"), str(tmp_path / "labels"), str(tmp_path / "data.yaml")
+    )
+    _, _, detections = dataset[0]
+    assert dataset.classes == list(pictures[0].class_names)
+    assert pictures[0].boxes is not None
+    np.testing.assert_allclose(detections.xyxy, pictures[0].boxes.xyxy, atol=0.01)
+    np.testing.assert_array_equal(detections.class_id, pictures[0].boxes.class_id)
+
+
+def test_two_pictures_of_one_name_do_not_clash(tmp_path: Path, pictures: list[Perception]) -> None:
+    with YoloWriter(tmp_path) as writer:
+        for picture in pictures:
+            writer.write(picture)
+    assert len(list((tmp_path / "labels").rglob("*.txt"))) == 2
