@@ -116,9 +116,7 @@ def slow_loss(
     return 0.05 * totals[0], totals[1], 0.5 * totals[2]
 
 
-def random_case(
-    seed: int, classes: int, images: int = 3
-) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
+def random_case(seed: int, classes: int, images: int = 3) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
     generator = torch.Generator().manual_seed(seed)
     height, width = SIZE
     outputs = [

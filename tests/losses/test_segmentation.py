@@ -42,9 +42,7 @@ def slow_tversky(logits: Tensor, target: Tensor, alpha: float, beta: float) -> f
                         present[channel] += 1
                     else:
                         wrong[channel] += p
-    losses = [
-        1 - hit[c] / (hit[c] + alpha * wrong[c] + beta * missed[c]) if present[c] else 0.0 for c in range(2)
-    ]
+    losses = [1 - hit[c] / (hit[c] + alpha * wrong[c] + beta * missed[c]) if present[c] else 0.0 for c in range(2)]
     return float((sum(losses) / 2) ** (4 / 3))
 
 

@@ -58,6 +58,7 @@ class Command(NamedTuple):
 
 
 COMMANDS: Final[tuple[Command, ...]] = (
+    Command("train", "train", "train"),
     Command("weights import", "weights", "import_weights"),
     Command("weights info", "weights", "info"),
 )

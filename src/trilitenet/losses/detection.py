@@ -211,9 +211,7 @@ class DetectionLoss(nn.Module):
         self.label_smoothing = label_smoothing
         self.strides = tuple(strides)
 
-    def forward(
-        self, outputs: Sequence[Tensor], boxes: Tensor, ignored: Tensor, labelled: Tensor
-    ) -> DetectionTerms:
+    def forward(self, outputs: Sequence[Tensor], boxes: Tensor, ignored: Tensor, labelled: Tensor) -> DetectionTerms:
         """Compute the terms.
 
         Args:
@@ -224,11 +222,16 @@ class DetectionLoss(nn.Module):
         """
         with torch.autocast(device_type=boxes.device.type, enabled=False):
             levels = [
-                self._level(index, output if output.dtype is torch.float64 else output.float(), boxes, ignored, labelled)
+                self._level(
+                    index, output if output.dtype is torch.float64 else output.float(), boxes, ignored, labelled
+                )
                 for index, output in enumerate(outputs)
             ]
         return DetectionTerms(
-            *(gain * torch.stack(terms).sum() for gain, terms in zip(self.gains, zip(*levels, strict=True), strict=True))
+            *(
+                gain * torch.stack(terms).sum()
+                for gain, terms in zip(self.gains, zip(*levels, strict=True), strict=True)
+            )
         )
 
     def _level(

@@ -1,0 +1,180 @@
+"""What a training run is told: one frozen dataclass, read from YAML and the command line, strictly."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import yaml
+
+from trilitenet.config import TASKS, Anchors, Task, get_variant, parse
+from trilitenet.data.transforms import Augmentation
+from trilitenet.errors import ConfigError
+
+__all__ = ["BASE_KEY", "TrainConfig", "merge", "read_recipe"]
+
+BASE_KEY: Final = "base"
+"""Key of a recipe that names another one, relative to it, whose values it takes over."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """A training run. The defaults are the package's own recipe; those that depart from the publication say so.
+
+    Attributes:
+        data: Root folder of a data set in the published layout.
+        train_split: Split to train on.
+        val_split: Split to validate on; empty for none.
+        classes: Names of the detection classes; those of the data set if left out.
+        sampling: Attribute -> value -> how often such an image is drawn, for example timeofday: {night: 2}.
+        samples_per_epoch: Images an epoch; all of them if left out.
+        input_size: (height, width) in pixels, multiples of 32 (Section IV-A: 640x384).
+        augmentation: Strengths of the random transforms.
+        variant: tiny, small or base (Section III-B).
+        tasks: Of detection, drivable and lane.
+        pcaa: With partial class activation attention.
+        litepan: With LitePAN's two paths.
+        spp: With spatial pyramid pooling.
+        anchors: (width, height) in input pixels, three a level; the default ones if left out.
+        init: Weight file to start from; what fits by name and shape is taken over.
+        epochs: Passes over the data (Section IV-A: 200).
+        batch_size: Images an optimiser step (Section IV-A: 16).
+        lr: Initial learning rate (Section IV-A: 0.001).
+        betas: Of AdamW (Section IV-A: 0.937, 0.999).
+        weight_decay: Of AdamW, for weights of convolutions and matrices alone.
+        final_lr: The cosine ends at this fraction of ``lr`` (published code: 0.2).
+        warmup_epochs: Linear warm-up takes this long, or ``warmup_steps`` if that is longer (published code: 3).
+        warmup_steps: See ``warmup_epochs`` (published code: 1000).
+        clip_gradient: Largest norm of the whole gradient; 0 for no limit (the publication has none).
+        ema_decay: Of the moving average of the weights; 0 switches it off (published code: 0.9999).
+        ema_ramp: The decay rises as 1 - exp(-updates / ramp) (published code: 2000).
+        task_weights: Of the losses of detection, drivable area and lane (Section III-C: 1, 0.3, 0.3).
+        balancing: fixed task weights, or learned ones (uncertainty).
+        box_gains: Of the box, objectness and class terms (Section III-C: 0.05, 1.0, 0.5).
+        single_class_loss: Train the class score also when there is one class (the published code does not).
+        label_smoothing: Of the class targets, in [0, 1).
+        drivable_tversky: alpha and beta (Section III-C: 0.7, 0.3).
+        lane_tversky: alpha and beta (Section III-C: 0.9, 0.1).
+        focal: alpha and gamma (Section III-C: 0.25, 2).
+        validate_every: Epochs between validations; the last epoch is always validated.
+        checkpoint_every: Epochs between checkpoints.
+        seed: Of weights, order and augmentation.
+        output: Folder of the run.
+        device: auto, cpu, cuda or mps.
+        precision: 32-true, bf16-mixed or 16-mixed; auto = bf16-mixed where the processor has it.
+        compile: Compile the network (slow start, faster steps; needs a C++ compiler on a CPU).
+        workers: Processes that read data ahead.
+        max_steps: Stop after so many optimiser steps; 0 for no limit.
+    """
+
+    data: str = ""
+    train_split: str = "train"
+    val_split: str = "val"
+    classes: tuple[str, ...] | None = None
+    sampling: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)
+    samples_per_epoch: int | None = None
+    input_size: tuple[int, int] = (384, 640)
+    augmentation: Augmentation = Augmentation()
+    variant: str = "tiny"
+    tasks: tuple[Task, ...] = TASKS
+    pcaa: bool = True
+    litepan: bool = True
+    spp: bool = True
+    anchors: Anchors | None = None
+    init: str | None = None
+    epochs: int = 200
+    batch_size: int = 16
+    lr: float = 1e-3
+    betas: tuple[float, float] = (0.937, 0.999)
+    weight_decay: float = 0.01
+    final_lr: float = 0.2
+    warmup_epochs: float = 3.0
+    warmup_steps: int = 1000
+    clip_gradient: float = 10.0
+    ema_decay: float = 0.9999
+    ema_ramp: float = 2000.0
+    task_weights: tuple[float, float, float] = (1.0, 0.3, 0.3)
+    balancing: Literal["fixed", "uncertainty"] = "fixed"
+    box_gains: tuple[float, float, float] = (0.05, 1.0, 0.5)
+    single_class_loss: bool = True
+    label_smoothing: float = 0.0
+    drivable_tversky: tuple[float, float] = (0.7, 0.3)
+    lane_tversky: tuple[float, float] = (0.9, 0.1)
+    focal: tuple[float, float] = (0.25, 2.0)
+    validate_every: int = 1
+    checkpoint_every: int = 1
+    seed: int = 0
+    output: str = "runs/train"
+    device: str = "auto"
+    precision: Literal["auto", "32-true", "bf16-mixed", "16-mixed"] = "auto"
+    compile: bool = False
+    workers: int = 2
+    max_steps: int = 0
+
+    def __post_init__(self) -> None:
+        get_variant(self.variant)
+        for name in ("epochs", "batch_size", "validate_every", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("weight_decay", "warmup_epochs", "warmup_steps", "clip_gradient", "workers", "max_steps"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
+        if not self.lr > 0:
+            raise ConfigError(f"lr must be above 0, got {self.lr}")
+        if not 0 <= self.ema_decay < 1:
+            raise ConfigError(f"ema_decay must be in [0, 1), got {self.ema_decay}")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists, numbers and strings, as YAML and checkpoints hold them."""
+        return _plain(dataclasses.asdict(self))  # type: ignore[no-any-return]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [_plain(item) for item in value]
+    return value
+
+
+def merge(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``first`` with the values of ``second`` laid over it, mappings within mappings alike."""
+    merged = dict(first)
+    for key, value in second.items():
+        old = merged.get(key)
+        merged[key] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return merged
+
+
+def read_recipe(path: str | Path | None, overrides: Mapping[str, Any] | None = None) -> TrainConfig:
+    """Read a recipe, with what its base gives and what the caller overrides.
+
+    Args:
+        path: A YAML file of `TrainConfig` keys; key ``base`` names another recipe to start from. None = defaults.
+        overrides: Key -> value, laid over the file; mappings within mappings alike.
+
+    Raises:
+        ConfigError: If it cannot be read, or on an unknown key (naming the nearest) or a wrong value.
+    """
+    mapping = _read(Path(path), ()) if path is not None else {}
+    source = str(path) if path is not None else "train"
+    return parse(TrainConfig, merge(mapping, overrides or {}), source)
+
+
+def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
+    if path.resolve() in seen:
+        raise ConfigError(f"{path}: is its own base, through {' -> '.join(str(p.name) for p in seen)}")
+    try:
+        mapping = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: cannot be read as YAML ({' '.join(str(error).split())})") from error
+    mapping = {} if mapping is None else mapping
+    if not isinstance(mapping, dict):
+        raise ConfigError(f"{path}: must hold 'key: value' lines")
+    mapping = {str(key): value for key, value in mapping.items()}
+    base = mapping.pop(BASE_KEY, None)
+    if base is None:
+        return mapping
+    return merge(_read(path.parent / str(base), (*seen, path.resolve())), mapping)
