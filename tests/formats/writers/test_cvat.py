@@ -3,6 +3,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -76,9 +77,11 @@ def test_mask_runs_by_hand() -> None:
 
 def test_datumaro_opens_it(tmp_path: Path, pictures: list[Perception]) -> None:
     datumaro = pytest.importorskip("datumaro")
-    write(tmp_path, pictures)
-    dataset = datumaro.Dataset.import_from(str(tmp_path), "cvat")
-    items = {item.id: item for item in dataset}
-    assert len(items) == 2
-    kinds = sorted(annotation.type.name for annotation in items["road"].annotations)
-    assert kinds == ["bbox", "bbox", "mask", "mask"]
+    write(tmp_path, pictures[:1])
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "road.jpg"), np.zeros((*pictures[0].size, 3), np.uint8))
+    (item,) = datumaro.Dataset.import_from(str(tmp_path), "cvat")
+    kinds = [annotation.type.name for annotation in item.annotations]
+    assert sorted(kinds) == ["bbox", "bbox", "mask", "mask"]
+    mask = next(annotation for annotation in item.annotations if annotation.type.name == "mask")
+    np.testing.assert_array_equal(mask.image.astype(bool), pictures[0].drivable)
