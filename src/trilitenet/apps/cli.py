@@ -58,6 +58,7 @@ class Command(NamedTuple):
 
 
 COMMANDS: Final[tuple[Command, ...]] = (
+    Command("data synthesize", "synthesize", "synthesize"),
     Command("train", "train", "train"),
     Command("weights import", "weights", "import_weights"),
     Command("weights info", "weights", "info"),

@@ -211,7 +211,7 @@ def label_scene(
         lines=_lines(world),
         objects=objects,
         lane_width=world.layout.lane_width,
-        offset=world.course.offset,
+        offset=world.course.offset - world.ego_lane,
         heading=world.course.heading,
         curvature=world.course.curvature,
         speed=speed,
@@ -226,11 +226,13 @@ def _lines(world: World) -> tuple[LineTruth, ...]:
     twins = [mark.d for mark in layout.markings if mark.twin]
     found: list[LineTruth] = []
 
-    def add(d: float, kind: Literal["solid", "dashed", "double", "kerb"], colour: Literal["white", "yellow", "none"]) -> None:
+    def add(
+        d: float, kind: Literal["solid", "dashed", "double", "kerb"], colour: Literal["white", "yellow", "none"]
+    ) -> None:
         points = course.line(d)
         near = points[:, 0] <= 60
         polynomial = np.polynomial.polynomial.polyfit(points[near, 0], points[near, 1], 3)
-        found.append(LineTruth(d, points, polynomial, kind, colour))
+        found.append(LineTruth(d - world.ego_lane, points, polynomial, kind, colour))
 
     for mark in layout.markings:
         if mark.twin:
@@ -275,7 +277,7 @@ def _objects(world: World, drawn: Rendering) -> tuple[ObjectTruth, ...]:
                 visible=visible,
                 distance=float(footprint[:, 0].min()) if abs(np.sin(pose.angle)) > 0.5 else pose.x,
                 lateral=pose.y,
-                d=pose.vehicle.d,
+                d=pose.vehicle.d - world.ego_lane,
                 speed=pose.vehicle.speed,
                 ignored=bool(hidden or tiny),
             )

@@ -156,13 +156,17 @@ class _Lighting:
         return red, green, blue
 
 
-def render(world: World, rng: np.random.Generator, *, faults: bool = True) -> Rendering:
+def render(
+    world: World, rng: np.random.Generator, *, faults: bool = True, moment: np.random.Generator | None = None
+) -> Rendering:
     """Draw a world.
 
     Args:
         world: What there is.
-        rng: Source of chance for weather and camera faults.
+        rng: Source of chance for the camera's faults.
         faults: Add blur, noise, exposure and compression of a cheap camera.
+        moment: Source of chance for what differs between frames of one drive (noise, rain), which is then not
+            compressed here; ``rng`` if left out.
     """
     camera = world.camera
     height, width = camera.size
@@ -181,9 +185,9 @@ def render(world: World, rng: np.random.Generator, *, faults: bool = True) -> Re
     for mask in (drivable, lines, paint):
         mask *= clear
     if world.light.weather == "rain":
-        _draw_rain(image, rng)
+        _draw_rain(image, moment or rng)
     if faults:
-        image = _camera_faults(image, world, rng)
+        image = _camera_faults(image, world, rng, moment)
     return Rendering(image, drivable, lines, paint, ids, poses, lit)
 
 
@@ -274,10 +278,7 @@ def _draw_ground(
     fine = _look_up(_noise(0.7, 11), along * 40 + shift, d * 40, smooth=False)
     coarse, grass, worn, crack = cv2.split(_look_up(_ground_tile(), along * 7 + shift, d * 14 + shift))
     fade = np.clip(np.float32(0.05) * inverse, 0, 1)
-    planes = [
-        np.float32(c) * (1 + np.float32(0.11) * grass + np.float32(0.12) * fine * fade)
-        for c in layout.terrain
-    ]
+    planes = [np.float32(c) * (1 + np.float32(0.11) * grass + np.float32(0.12) * fine * fade) for c in layout.terrain]
 
     def blend(alpha: Plane, colour: Colour, gain: Plane | None = None) -> None:
         for plane, value in zip(planes, colour, strict=True):
@@ -450,9 +451,7 @@ def _fixed(points: NDArray[np.float64]) -> NDArray[np.int32]:
     return np.round(np.clip(points, -30000, 30000) * (1 << _SHIFT)).astype(np.int32)
 
 
-def _fill(
-    image: NDArray[np.uint8], ids: NDArray[np.uint8], pixels: NDArray[np.float64], colour: Colour
-) -> None:
+def _fill(image: NDArray[np.uint8], ids: NDArray[np.uint8], pixels: NDArray[np.float64], colour: Colour) -> None:
     if np.isnan(pixels).any():
         return
     fixed = _fixed(pixels)
@@ -464,7 +463,7 @@ def _draw_barrier(
     world: World, barrier: Barrier, image: NDArray[np.uint8], ids: NDArray[np.uint8], lighting: _Lighting
 ) -> None:
     course = world.course
-    s = np.concatenate([np.arange(2.0, 40, 2.0), np.arange(40.0, FAR * 0.8, 8.0)])
+    s = np.concatenate([np.arange(2.0, 40, 2.0), np.arange(40.0, FAR * 0.8, 8.0)]) - world.travelled % 8
     s = s[(s >= barrier.start) & (s <= barrier.end)]
     if len(s) < 2:
         return
@@ -505,7 +504,9 @@ def _draw_barrier(
             upper = np.stack([x[span], y[span], np.full(j + 1 - i, peak)], axis=1)
             pixels = world.camera.to_pixels(np.concatenate([lower, upper[::-1]]))
             red, green, blue = barrier.colour
-            shade = lighting.tone((red * gain * grain, green * gain * grain, blue * gain * grain), float(x[i]), float(y[i]))
+            shade = lighting.tone(
+                (red * gain * grain, green * gain * grain, blue * gain * grain), float(x[i]), float(y[i])
+            )
             _fill(image, ids, pixels, shade)
 
 
@@ -524,7 +525,9 @@ def _draw_item(
     elif item.kind == "lamp":
         tone = lighting.tone((88.0, 90.0, 92.0), x, y)
         half = 0.07
-        ends = np.array([[x, y - half, 0], [x, y + half, 0], [x, y + half * 0.7, item.height], [x, y - half * 0.7, item.height]])
+        ends = np.array(
+            [[x, y - half, 0], [x, y + half, 0], [x, y + half * 0.7, item.height], [x, y - half * 0.7, item.height]]
+        )
         _fill(image, ids, camera.to_pixels(ends), tone)
         arm = np.array([[x, y, item.height], [x, y + item.width, item.height + 0.2],
                         [x, y + item.width, item.height + 0.08], [x, y, item.height - 0.1]])  # fmt: skip
@@ -547,17 +550,36 @@ def _draw_item(
             px, py, _ = world.course.at(item.s, edge)
             pole = np.array([[px, py - 0.2, 0], [px, py + 0.2, 0], [px, py + 0.2, 6.6], [px, py - 0.2, 6.6]])
             _fill(image, ids, camera.to_pixels(pole), grey)
-        beam = np.array([(*world.course.at(item.s, e)[:2], z) for e, z in ((right - 1, 6.4), (left + 1, 6.4), (left + 1, 6.8), (right - 1, 6.8))])
+        beam = np.array(
+            [
+                (*world.course.at(item.s, e)[:2], z)
+                for e, z in ((right - 1, 6.4), (left + 1, 6.4), (left + 1, 6.8), (right - 1, 6.8))
+            ]
+        )
         _fill(image, ids, camera.to_pixels(beam), grey)
         for lane in world.layout.lanes[:3]:
-            board = np.array([(*world.course.at(item.s, lane + e)[:2], z) for e, z in ((-1.5, 5.5), (1.5, 5.5), (1.5, 7.4), (-1.5, 7.4))])
+            board = np.array(
+                [
+                    (*world.course.at(item.s, lane + e)[:2], z)
+                    for e, z in ((-1.5, 5.5), (1.5, 5.5), (1.5, 7.4), (-1.5, 7.4))
+                ]
+            )
             blue: Colour = (18.0, 62.0, 140.0) if item.style % 2 else (12.0, 96.0, 62.0)
-            _fill(image, ids, camera.to_pixels(board), lighting.lamp_tone(tuple(c * max(0.35, world.light.ambient[1]) for c in blue), x, y))  # type: ignore[arg-type]
+            _fill(
+                image,
+                ids,
+                camera.to_pixels(board),
+                lighting.lamp_tone(tuple(c * max(0.35, world.light.ambient[1]) for c in blue), x, y),
+            )  # type: ignore[arg-type]
     elif item.kind == "pedestrian":
         rng = np.random.default_rng(item.style)
         coat, legs = rng.uniform(20, 190, 3), rng.uniform(20, 90, 3)
         tall = item.height
-        for low, high, wide, colour in ((0.0, 0.5, 0.15, legs), (0.45, 0.84, 0.23, coat), (0.85, 1.0, 0.1, (190, 150, 125))):
+        for low, high, wide, colour in (
+            (0.0, 0.5, 0.15, legs),
+            (0.45, 0.84, 0.23, coat),
+            (0.85, 1.0, 0.1, (190, 150, 125)),
+        ):
             turn = np.linspace(0, 2 * math.pi, 10, endpoint=False)
             ring = np.stack([np.full(10, x), y + wide * np.cos(turn),
                              tall * ((low + high) / 2 + (high - low) / 2 * np.sin(turn))], axis=1)  # fmt: skip
@@ -567,7 +589,13 @@ def _draw_item(
 
 
 def _draw_sign(
-    camera: Camera, item: Item, x: float, y: float, image: NDArray[np.uint8], ids: NDArray[np.uint8], lighting: _Lighting
+    camera: Camera,
+    item: Item,
+    x: float,
+    y: float,
+    image: NDArray[np.uint8],
+    ids: NDArray[np.uint8],
+    lighting: _Lighting,
 ) -> None:
     pole = np.array([[x, y - 0.04, 0], [x, y + 0.04, 0], [x, y + 0.04, item.height], [x, y - 0.04, item.height]])
     _fill(image, ids, camera.to_pixels(pole), lighting.tone((130.0, 132.0, 134.0), x, y))
@@ -594,8 +622,10 @@ def _draw_sign(
 def _facade(style: int) -> NDArray[np.uint8]:
     """Return an (160, 256, 3) uint8 picture of a house front."""
     rng = np.random.default_rng(900 + style)
-    base = np.array([(168, 150, 132), (188, 180, 168), (140, 92, 74), (120, 118, 116), (196, 186, 150), (96, 84, 78)][style % 6])
-    wall = np.clip(base + 6 * _noise(1.2, 18)[: 160, : 256, None], 0, 255).astype(np.uint8)
+    base = np.array(
+        [(168, 150, 132), (188, 180, 168), (140, 92, 74), (120, 118, 116), (196, 186, 150), (96, 84, 78)][style % 6]
+    )
+    wall = np.clip(base + 6 * _noise(1.2, 18)[:160, :256, None], 0, 255).astype(np.uint8)
     floors, columns = int(rng.integers(3, 6)), int(rng.integers(5, 11))
     fh, fw = 160 / floors, 256 / columns
     for i in range(floors):
@@ -663,11 +693,15 @@ def _tree(style: int) -> NDArray[np.uint8]:
             angle, long = rng.uniform(-1.2, 1.2), rng.uniform(30, 110)
             base = 130 - rng.uniform(0, 60)
             tip = (int(72 + long * math.sin(angle) * 0.6), int(base - long * math.cos(angle) * 0.8))
-            cv2.line(sprite, (72, int(base)), tip, (bark, int(bark * 0.87), int(bark * 0.78), 255), int(rng.integers(1, 3)))
+            cv2.line(
+                sprite, (72, int(base)), tip, (bark, int(bark * 0.87), int(bark * 0.78), 255), int(rng.integers(1, 3))
+            )
         return np.asarray(cv2.GaussianBlur(sprite, (3, 3), 0), np.uint8)
     count = 520
     # A crown is a handful of clumps; each clump is lit from above.
-    clumps = [(72 + rng.normal(0, 24), rng.uniform(30, 112), rng.uniform(16, 34)) for _ in range(int(rng.integers(6, 12)))]
+    clumps = [
+        (72 + rng.normal(0, 24), rng.uniform(30, 112), rng.uniform(16, 34)) for _ in range(int(rng.integers(6, 12)))
+    ]
     clumps.sort(key=lambda clump: -clump[1])
     leaf = (142, 96, 46) if autumn else (66 + 12 * (style % 3), 84, 44)
     for i in range(count):
@@ -728,13 +762,21 @@ def _paste(
     part = cv2.resize(part, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA if shrink else cv2.INTER_LINEAR)
     white, black = lighting.tone((255.0, 255.0, 255.0), x, y), lighting.tone((0.0, 0.0, 0.0), x, y)
     colours = cv2.transform(
-        part, np.array([[(white[0] - black[0]) / 255, 0, 0, 0, black[0]], [0, (white[1] - black[1]) / 255, 0, 0, black[1]],
-                        [0, 0, (white[2] - black[2]) / 255, 0, black[2]]])  # fmt: skip
+        part,
+        np.array(
+            [
+                [(white[0] - black[0]) / 255, 0, 0, 0, black[0]],
+                [0, (white[1] - black[1]) / 255, 0, 0, black[1]],
+                [0, 0, (white[2] - black[2]) / 255, 0, black[2]],
+            ]
+        ),  # fmt: skip
     )
     alpha = part[..., 3]
     region = image[y0:y1, x0:x1]
     weight = alpha.astype(np.float32) / 255
-    region[:] = np.asarray(cv2.blendLinear(np.ascontiguousarray(colours), np.ascontiguousarray(region), weight, 1 - weight))
+    region[:] = np.asarray(
+        cv2.blendLinear(np.ascontiguousarray(colours), np.ascontiguousarray(region), weight, 1 - weight)
+    )
     ids[y0:y1, x0:x1][alpha > 127] = SCENERY
 
 
@@ -782,7 +824,9 @@ def _draw_bonnet(world: World, image: NDArray[np.uint8], ids: NDArray[np.uint8])
     rng = np.random.default_rng(world.texture)
     u = np.linspace(-0.05, 1.05, 24)
     crest = height * (1 - world.bonnet * (1 - 0.55 * (2 * u - 1) ** 2))
-    outline = np.concatenate([np.stack([u * width, crest], axis=1), [[width * 1.05, height + 9], [-width * 0.05, height + 9]]])
+    outline = np.concatenate(
+        [np.stack([u * width, crest], axis=1), [[width * 1.05, height + 9], [-width * 0.05, height + 9]]]
+    )
     paint = rng.uniform(12, 110)
     colour = tuple(float(paint * a * (1 + rng.normal(0, 0.05))) for a in world.light.ambient)
     _fill(image, ids, outline, (colour[0], colour[1], colour[2]))
@@ -819,7 +863,9 @@ def _draw_rain(image: NDArray[np.uint8], rng: np.random.Generator) -> None:
         mask = np.zeros(region.shape[:2], np.uint8)
         cv2.circle(mask, (u - x0, v - y0), r, 255, -1, cv2.LINE_AA)
         weight = mask.astype(np.float32) / 255 * np.float32(0.75)
-        region[:] = np.asarray(cv2.blendLinear(np.asarray(lens, np.uint8), np.ascontiguousarray(region), weight, 1 - weight))
+        region[:] = np.asarray(
+            cv2.blendLinear(np.asarray(lens, np.uint8), np.ascontiguousarray(region), weight, 1 - weight)
+        )
 
 
 @functools.lru_cache(maxsize=1)
@@ -829,7 +875,9 @@ def _grain() -> NDArray[np.int8]:
     return np.clip(noise, -127, 127).astype(np.int8)
 
 
-def _camera_faults(image: NDArray[np.uint8], world: World, rng: np.random.Generator) -> NDArray[np.uint8]:
+def _camera_faults(
+    image: NDArray[np.uint8], world: World, rng: np.random.Generator, moment: np.random.Generator | None
+) -> NDArray[np.uint8]:
     """Blur, vignette, exposure, white balance, sensor noise and compression."""
     height, width = image.shape[:2]
     if rng.random() < 0.5:
@@ -852,14 +900,18 @@ def _camera_faults(image: NDArray[np.uint8], world: World, rng: np.random.Genera
         image = np.asarray(cv2.multiply(image, cv2.merge([fall] * 3), scale=1 / 255), np.uint8)
     level = float(rng.gamma(2.0, 1.3)) * (2.2 if night else 1.0)
     grain = _grain()
-    y, x = int(rng.integers(0, 1024)), int(rng.integers(0, 1024))
+    y, x = (int(v) for v in (moment or rng).integers(0, 1024, 2))
     rows = np.arange(y, y + height) & 1023
-    picked = grain[rows][:, np.arange(x, x + width) & 1023] if x + width > 1024 or width > 1024 else grain[rows, x : x + width]
+    picked = (
+        grain[rows][:, np.arange(x, x + width) & 1023]
+        if x + width > 1024 or width > 1024
+        else grain[rows, x : x + width]
+    )
     image = _add_noise(image, picked, level / 32)
-    if rng.random() < 0.6:
+    if moment is None and rng.random() < 0.6:
         quality = int(rng.integers(35, 92))
-        _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-        image = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+        _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+        image = np.asarray(cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), np.uint8)
     return image
 
 

@@ -100,7 +100,13 @@ def _car(
     )
     part = Part(outline, surfaces, windows, belt=boot_z * height, lean=0.2, width=width)
     radius = 0.215 * height if height < 1.6 else 0.21 * height
-    lights = (boot_z * height * 0.78, boot_z * height * 1.0, 0.2 * width, (bonnet_z - 0.15) * height, bonnet_z * height - 0.02)
+    lights = (
+        boot_z * height * 0.78,
+        boot_z * height * 1.0,
+        0.2 * width,
+        (bonnet_z - 0.15) * height,
+        bonnet_z * height - 0.02,
+    )
     return Shape(length, width, height, (part,), ((REAR_AXLE, radius), (length - 0.85, radius)), lights)
 
 
@@ -279,7 +285,13 @@ class _Pen:
     """Draws polygons of one vehicle onto the picture and its number onto the map of objects."""
 
     def __init__(
-        self, image: NDArray[np.uint8], ids: NDArray[np.uint8], number: int, camera: Camera, pose: VehiclePose, tone: Tone
+        self,
+        image: NDArray[np.uint8],
+        ids: NDArray[np.uint8],
+        number: int,
+        camera: Camera,
+        pose: VehiclePose,
+        tone: Tone,
     ) -> None:
         self.image, self.ids, self.number, self.camera, self.pose = image, ids, number, camera, pose
         self.matrix = pose.projection(camera)
@@ -377,7 +389,8 @@ def draw_vehicle(
                 if share < 1 and not fine:
                     break
                 ring = np.stack(
-                    [axle + radius * share * np.cos(turn), np.full(14, y), radius + radius * share * np.sin(turn)], axis=1
+                    [axle + radius * share * np.cos(turn), np.full(14, y), radius + radius * share * np.sin(turn)],
+                    axis=1,
                 )
                 pen.polygon(ring, colour)
     return _draw_lights(pen, shape, vehicle, lamps=lamps, fine=fine, rear_seen=rear_seen, front_seen=front_seen)

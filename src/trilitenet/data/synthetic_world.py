@@ -309,6 +309,11 @@ class World:
     urban: bool = False
     bonnet: float = 0.0
 
+    @property
+    def ego_lane(self) -> float:
+        """Centre of the lane that the ego vehicle is in: d in metres."""
+        return min(self.layout.lanes, key=lambda d: abs(d - self.course.offset))
+
 
 def random_world(rng: np.random.Generator, size: tuple[int, int]) -> World:
     """Draw a scene.
@@ -331,7 +336,10 @@ def random_world(rng: np.random.Generator, size: tuple[int, int]) -> World:
     offset, heading = float(np.clip(rng.normal(0.0, 0.25), -0.6, 0.6)), float(rng.normal(0.0, 0.012))
     if len(layout.lanes) > 1 and rng.random() < 0.12:
         neighbour = min((d for d in layout.lanes if d != 0.0), key=abs)
-        offset, heading = neighbour * float(rng.uniform(0.2, 0.5)), math.copysign(float(rng.uniform(0, 0.05)), neighbour)
+        offset, heading = (
+            neighbour * float(rng.uniform(0.2, 0.5)),
+            math.copysign(float(rng.uniform(0, 0.05)), neighbour),
+        )
     course = Course(lambda s: bend + rate * np.clip(s, 0, 160), offset, heading)
     urban = kind in ("city", "residential", "one-way") and rng.random() < 0.7
     skyline = (float(rng.uniform(0.0, 0.09)) if rng.random() < 0.6 else 0.0, float(rng.uniform(0.015, 0.10)))
@@ -565,7 +573,14 @@ _PAINTS: Final[tuple[Colour, ...]] = (
 
 
 def random_vehicle(
-    rng: np.random.Generator, s: float, d: float, yaw: float, *, heavy: float = 0.18, number: int = 0, speed: float = 0.0
+    rng: np.random.Generator,
+    s: float,
+    d: float,
+    yaw: float,
+    *,
+    heavy: float = 0.18,
+    number: int = 0,
+    speed: float = 0.0,
 ) -> Vehicle:
     """Draw a vehicle's kind and colour.
 

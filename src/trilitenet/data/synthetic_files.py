@@ -1,0 +1,131 @@
+"""Synthetic scenes as files in the published layout, which training and evaluation read like any other data set."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import functools
+import json
+import multiprocessing
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from trilitenet.data.description import DESCRIPTION_FILE, DatasetDescription, write_description
+from trilitenet.data.sample import Sample
+from trilitenet.data.synthetic import SyntheticScenes
+from trilitenet.errors import ConfigError, OutputError
+
+__all__ = ["annotation", "write_dataset", "write_sample"]
+
+FOLDERS = ("images", "det_annotations", "da_seg_annotations", "ll_seg_annotations")
+
+
+def write_dataset(
+    root: str | Path,
+    split: str = "train",
+    count: int = 100,
+    seed: int = 0,
+    *,
+    size: tuple[int, int] = (384, 640),
+    labels: Literal["lines", "paint"] = "lines",
+    workers: int = 1,
+    progress: Callable[[int], None] | None = None,
+) -> None:
+    """Write scenes in the published layout.
+
+    ``images/{split}/NAME.jpg``, ``det_annotations/{split}/NAME.json`` (BDD100K's form an image; uncertain vehicles have
+    ``attributes.crowd: true``), ``da_seg_annotations/{split}/NAME.png`` and ``ll_seg_annotations/{split}/NAME.png``
+    (255 = drivable or lane line), and ``dataset.yaml``.
+
+    Args:
+        root: Folder to write into.
+        split: Name of the split.
+        count: How many scenes.
+        seed: Their seed; use another one for another split.
+        size: (height, width) in pixels.
+        labels: How lanes are marked (see `SyntheticScenes`).
+        workers: Processes to share the work.
+        progress: Called with the number of scenes done after each.
+
+    Raises:
+        ConfigError: If ``count`` or ``workers`` is under 1.
+        OutputError: If the split exists already, or a file cannot be written.
+    """
+    if count < 1 or workers < 1:
+        raise ConfigError(f"count and workers must be at least 1, got {count} and {workers}")
+    root = Path(root)
+    if any((root / FOLDERS[0] / split).glob("*")):
+        raise OutputError(f"{root / FOLDERS[0] / split} is not empty; choose another folder or split, or remove it")
+    try:
+        for folder in FOLDERS:
+            (root / folder / split).mkdir(parents=True, exist_ok=True)
+        if not (root / DESCRIPTION_FILE).exists():
+            write_description(
+                root,
+                DatasetDescription(
+                    name="synthetic road scenes",
+                    classes={"vehicle": ("car",)},
+                    attributes=("timeofday", "weather", "scene", "source"),
+                    licence="MIT, as the generator",
+                    source=f"trilitenet data synthesize, seed {seed}",
+                ),
+            )
+        job = functools.partial(_write_scene, root, split, seed, size, labels, count)
+        if workers == 1:
+            for done in range(count):
+                job(done)
+                if progress:
+                    progress(done + 1)
+            return
+        context = multiprocessing.get_context("spawn")
+        with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
+            for done, _ in enumerate(pool.map(job, range(count), chunksize=4)):
+                if progress:
+                    progress(done + 1)
+    except OSError as error:
+        raise OutputError(f"{root}: cannot write ({error})") from error
+
+
+def _write_scene(
+    root: Path, split: str, seed: int, size: tuple[int, int], labels: Literal["lines", "paint"], count: int, index: int
+) -> None:
+    write_sample(root, split, SyntheticScenes(seed, size, count, labels=labels)[index])
+
+
+def write_sample(root: Path, split: str, sample: Sample) -> None:
+    """Write one sample; a task that is not labelled has no file."""
+    Image.fromarray(sample.image).save(root / "images" / split / f"{sample.name}.jpg", quality=92)
+    if sample.boxes is not None:
+        text = json.dumps(annotation(sample), separators=(",", ":"))
+        (root / "det_annotations" / split / f"{sample.name}.json").write_text(text, encoding="utf-8")
+    for folder, mask in (("da_seg_annotations", sample.drivable), ("ll_seg_annotations", sample.lane)):
+        if mask is not None:
+            Image.fromarray(_visible(mask)).save(root / folder / split / f"{sample.name}.png")
+
+
+def _visible(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return (mask > 0).astype(np.uint8) * 255
+
+
+def annotation(sample: Sample) -> dict[str, object]:
+    """Return the sample's boxes as BDD100K's per-image JSON."""
+    boxes = np.zeros((0, 4), np.float32) if sample.boxes is None else sample.boxes
+    every = [(box, False) for box in boxes] + [(box, True) for box in sample.ignored]
+    objects = [
+        {
+            "category": "car",
+            "id": number,
+            "attributes": {"crowd": crowd},
+            "box2d": {key: round(float(v), 2) for key, v in zip(("x1", "y1", "x2", "y2"), box, strict=True)},
+        }
+        for number, (box, crowd) in enumerate(every)
+    ]
+    return {
+        "name": sample.name,
+        "attributes": dict(sample.attributes),
+        "frames": [{"timestamp": 0, "objects": objects}],
+    }
