@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Final
 
@@ -50,9 +51,9 @@ class Batch:
 
     def to(self, device: torch.device | str, *, non_blocking: bool = False) -> Batch:
         """Return the batch on another device."""
-        return dataclasses.replace(self, **{
-            name: getattr(self, name).to(device, non_blocking=non_blocking) for name in _TENSORS
-        })
+        return dataclasses.replace(
+            self, **{name: getattr(self, name).to(device, non_blocking=non_blocking) for name in _TENSORS}
+        )
 
     def pin_memory(self) -> Batch:
         """Return the batch in page-locked memory (called by PyTorch's data loader)."""
@@ -117,7 +118,7 @@ def _strips(valid: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return (K, 4) xyxy px: the invalid area as upright strips, each as high as the area in it."""
     strips: list[tuple[float, float, float, float]] = []
     edges = np.linspace(0, valid.shape[1], _EGO_STRIPS + 1).round().astype(int)
-    for left, right in zip(edges[:-1], edges[1:], strict=True):
+    for left, right in itertools.pairwise(edges):
         rows = np.flatnonzero(~valid[:, left:right].all(axis=1))
         if len(rows):
             strips.append((left, rows[0], right, rows[-1] + 1))

@@ -81,9 +81,7 @@ class DatasetDescription:
         return tuple(self.classes) or ("vehicle",)
 
 
-def class_table(
-    class_names: Sequence[str], classes: Mapping[str, Sequence[str]] | None = None
-) -> dict[str, int]:
+def class_table(class_names: Sequence[str], classes: Mapping[str, Sequence[str]] | None = None) -> dict[str, int]:
     """Return category -> class id.
 
     A class holds the categories that ``classes`` lists for it, else the category of its own name; ``vehicle`` alone
@@ -125,9 +123,7 @@ def read_description(root: Path) -> DatasetDescription:
 def write_description(root: Path, description: DatasetDescription) -> None:
     """Write ``root/dataset.yaml``, without the keys that hold their default."""
     default = dataclasses.asdict(DatasetDescription())
-    content = {
-        key: _plain(value) for key, value in dataclasses.asdict(description).items() if value != default[key]
-    }
+    content = {key: _plain(value) for key, value in dataclasses.asdict(description).items() if value != default[key]}
     text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)
     (root / DESCRIPTION_FILE).write_text(text, encoding="utf-8")
 

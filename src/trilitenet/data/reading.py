@@ -50,6 +50,8 @@ DRIVABLE_FOLDER: Final = "da_seg_annotations"
 LANE_FOLDER: Final = "ll_seg_annotations"
 IMAGE_ENDINGS: Final = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
 
+_IGNORED: Final = 2
+
 
 class SampleSource(Protocol):
     """Anything that samples can be taken from by index."""
@@ -91,12 +93,15 @@ def decode_mask(
     grey = cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE) if len(buffer) else None
     if grey is None:
         raise DataError(f"{name}: not a mask that can be decoded; run `trilitenet data check` on the data set")
-    valid = ~np.isin(grey, meaning.ignore) if meaning.ignore else None
-    mask = cv2.threshold(grey, meaning.above, 1, cv2.THRESH_BINARY)[1]
-    if valid is not None:
-        mask[~valid] = 0
-        if valid.all():
-            valid = None
+    if not meaning.ignore:
+        return cv2.threshold(grey, meaning.above, 1, cv2.THRESH_BINARY)[1], None
+    table = (np.arange(256) > meaning.above).astype(np.uint8)
+    table[list(meaning.ignore)] = _IGNORED
+    mask = cv2.LUT(grey, table)
+    valid = mask != _IGNORED
+    if valid.all():
+        return mask, None
+    mask[~valid] = 0
     return mask, valid
 
 
@@ -268,9 +273,7 @@ class DrivingDataset:
         if task not in self._tasks:
             return None, None
         folder, meaning = (
-            (DRIVABLE_FOLDER, self.description.drivable)
-            if task == "drivable"
-            else (LANE_FOLDER, self.description.lane)
+            (DRIVABLE_FOLDER, self.description.drivable) if task == "drivable" else (LANE_FOLDER, self.description.lane)
         )
         path = self.root / folder / self.split / f"{name}.png"
         try:
@@ -394,9 +397,7 @@ def _index_attributes(root: Path, split: str) -> dict[str, dict[str, str]]:
         if not {"name", "split"} <= columns:
             raise DataError(f"{path}: needs the columns 'name' and 'split'")
         extra = sorted(columns - {"name", "split"})
-        return {
-            row["name"]: {column: row[column] or "" for column in extra} for row in reader if row["split"] == split
-        }
+        return {row["name"]: {column: row[column] or "" for column in extra} for row in reader if row["split"] == split}
 
 
 @functools.lru_cache(maxsize=64)

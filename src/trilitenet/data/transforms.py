@@ -35,6 +35,7 @@ __all__ = [
     "warp",
 ]
 
+
 class Transform(Protocol):
     """A map from a sample to one at canvas size; all its randomness comes from ``rng``."""
 
@@ -368,9 +369,7 @@ def _move_boxes(
     factor = np.array([box.resized[1] / box.source[1], box.resized[0] / box.source[0]] * 2)
     resized = boxes * factor
     # Edges lie half a pixel outside the centres of the outermost pixels.
-    corners = np.stack(
-        [resized[:, [0, 1]], resized[:, [2, 1]], resized[:, [2, 3]], resized[:, [0, 3]]], axis=1
-    ) - 0.5
+    corners = np.stack([resized[:, [0, 1]], resized[:, [2, 1]], resized[:, [2, 3]], resized[:, [0, 3]]], axis=1) - 0.5
     moved = corners @ matrix[:, :2].T + matrix[:, 2] + 0.5
     hull = np.concatenate([moved.min(axis=1), moved.max(axis=1)], axis=1).astype(np.float32)
     clipped: NDArray[np.float32] = hull.copy()
@@ -385,7 +384,7 @@ def _move_boxes(
 
 
 def _mirror(boxes: NDArray[np.float32], width: int) -> NDArray[np.float32]:
-    mirrored = boxes.copy()
+    mirrored: NDArray[np.float32] = boxes.copy()
     mirrored[:, 0] = width - boxes[:, 2]
     mirrored[:, 2] = width - boxes[:, 0]
     return mirrored

@@ -1,0 +1,556 @@
+"""From records of any foreign format to the published layout: parallel, resumable, idempotent.
+
+Each image's files are written under another name and then renamed, and a journal beside them says which images are
+done and what was left out, so a conversion that was interrupted goes on where it stood and ends the same.
+"""
+
+from __future__ import annotations
+
+import collections
+import concurrent.futures
+import csv
+import dataclasses
+import io
+import json
+import logging
+import multiprocessing
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from trilitenet.data.description import (
+    DESCRIPTION_FILE,
+    DatasetDescription,
+    MaskMeaning,
+    class_table,
+    read_description,
+    write_description,
+)
+from trilitenet.data.lane_edges import centre_line, pair_edges
+from trilitenet.data.rasterise import draw_line, fill_polygon
+from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, IMAGE_FOLDER, LANE_FOLDER
+from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel, RecordSource
+from trilitenet.errors import ConfigError, DataError, OutputError
+
+__all__ = ["ConversionOptions", "ConversionReport", "convert", "drivable_mask", "lane_mask"]
+
+_logger = logging.getLogger(__name__)
+
+REFERENCE_WIDTH: Final = 1280
+"""Line widths and gaps are in pixels of an image this wide."""
+
+ALTERNATIVE_VALUE: Final = 127
+"""Mask value of alternative areas when they are kept apart from direct ones (255)."""
+
+IGNORE_VALUE: Final = 64
+"""Mask value of pixels that are neither foreground nor background."""
+
+_STATE_FOLDER: Final = ".conversion"
+
+
+@dataclasses.dataclass(frozen=True)
+class ConversionOptions:
+    """What to make of the labels.
+
+    Attributes:
+        classes: Class name -> categories that belong to it.
+        ignore: Categories whose boxes become ignored regions.
+        lane_width: Split -> width of a drawn lane marking in pixels of a 1280-pixel wide image; ``"*"`` for others.
+        crosswalk: Draw crosswalks as lane markings.
+        vertical: Draw markings across the road (stop lines) as lane markings.
+        lane_categories: Draw these alone; empty = all.
+        pair_edges: Join the two edges of a marking into its centre line; False draws each edge.
+        max_gap: Edges further apart than this, in pixels of a 1280-pixel wide image, are two markings.
+        keep_alternative: Keep alternative drivable areas apart, as value 127 instead of 255.
+        images: Hard-link images (copied where that is impossible), copy them, or point symbolic links at them.
+    """
+
+    classes: dict[str, tuple[str, ...]] = dataclasses.field(
+        default_factory=lambda: {"vehicle": ("car", "truck", "bus", "train")}
+    )
+    ignore: tuple[str, ...] = ()
+    lane_width: dict[str, float] = dataclasses.field(default_factory=lambda: {"train": 8.0, "*": 2.0})
+    crosswalk: bool = False
+    vertical: bool = False
+    lane_categories: tuple[str, ...] = ()
+    pair_edges: bool = True
+    max_gap: float = 40.0
+    keep_alternative: bool = False
+    images: Literal["link", "copy", "symlink"] = "link"
+
+    def __post_init__(self) -> None:
+        if any(width <= 0 for width in self.lane_width.values()):
+            raise ConfigError(f"lane widths must be above 0, got {self.lane_width}")
+        class_table(tuple(self.classes), self.classes)
+
+    def width(self, split: str) -> float:
+        """Return the width of a lane marking for a split."""
+        return self.lane_width.get(split, self.lane_width.get("*", 2.0))
+
+
+@dataclasses.dataclass(frozen=True)
+class ConversionReport:
+    """What a conversion did.
+
+    Attributes:
+        images: Split -> images written.
+        labelled: Split -> task -> images labelled for it.
+        objects: Split -> class (or ``ignored``) -> boxes written.
+        lanes: Split -> ``"pairs"``, ``"single lines"`` -> lane markings drawn.
+        dropped: Split -> reason -> how many labels, or images, were left out.
+    """
+
+    images: dict[str, int]
+    labelled: dict[str, dict[str, int]]
+    objects: dict[str, dict[str, int]]
+    lanes: dict[str, dict[str, int]]
+    dropped: dict[str, dict[str, int]]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``json.dumps`` takes."""
+        return dataclasses.asdict(self)
+
+
+def convert(
+    source: RecordSource,
+    out: str | Path,
+    options: ConversionOptions | None = None,
+    *,
+    splits: Iterable[str] | None = None,
+    workers: int = 0,
+    description: DatasetDescription | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> ConversionReport:
+    """Write a foreign data set in the published layout.
+
+    What is there already from an earlier run with the same options is kept; an image whose labels are broken is left
+    out, counted and logged.
+
+    Args:
+        source: The foreign data set.
+        out: Folder to write; made if missing.
+        options: What to make of the labels.
+        splits: Only these; all if left out.
+        workers: Processes; 0 converts in this one.
+        description: Name, licence and the like for ``dataset.yaml``.
+        progress: Called with (images done, images in all).
+
+    Raises:
+        OutputError: If ``out`` holds something else, or a conversion with other options.
+        DataError: If a split is unknown.
+    """
+    options = options or ConversionOptions()
+    root = Path(out)
+    chosen = tuple(splits) if splits is not None else source.splits
+    unknown = [split for split in chosen if split not in source.splits]
+    if unknown:
+        raise DataError(f"no split {unknown[0]!r}; there are {', '.join(source.splits)}")
+    state = _open_state(root, options)
+    names = {split: source.names(split) for split in chosen}
+    total = sum(map(len, names.values()))
+    finished = 0
+    summaries: dict[str, dict[str, dict[str, Any]]] = {}
+    for split in chosen:
+        for folder in (IMAGE_FOLDER, DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER):
+            (root / folder / split).mkdir(parents=True, exist_ok=True)
+        done = _read_journal(root, state, split, set(names[split]))
+        finished += len(done)
+        if progress:
+            progress(finished, total)
+        todo = [name for name in names[split] if name not in done]
+        with _journal_path(state, split).open("a", encoding="utf-8") as journal:
+            for summary in _run(source, split, todo, root, options, workers):
+                done[summary["name"]] = summary
+                journal.write(json.dumps(summary, sort_keys=True) + "\n")
+                journal.flush()
+                finished += 1
+                if progress:
+                    progress(finished, total)
+        _rewrite(_journal_path(state, split), "".join(json.dumps(done[n], sort_keys=True) + "\n" for n in sorted(done)))
+        summaries[split] = done
+    report = _report(summaries)
+    _finish(root, options, description, report)
+    return report
+
+
+def drivable_mask(
+    areas: Iterable[AreaLabel], size: tuple[int, int], *, keep_alternative: bool = False
+) -> NDArray[np.uint8]:
+    """Draw drivable areas, later ones over earlier ones.
+
+    Args:
+        areas: Polygons in pixels.
+        size: (height, width).
+        keep_alternative: Draw alternative areas with 127 instead of 255.
+
+    Returns:
+        (height, width) uint8: 255 direct, 255 or 127 alternative, 0 elsewhere.
+    """
+    mask = np.zeros(size, np.uint8)
+    for area in areas:
+        alternative = keep_alternative and area.kind == "alternative"
+        fill_polygon(mask, area.points, ALTERNATIVE_VALUE if alternative else 255)
+    return mask
+
+
+def lane_mask(
+    lanes: Iterable[LaneLabel], size: tuple[int, int], width: float, options: ConversionOptions
+) -> tuple[NDArray[np.uint8], Counter[str], Counter[str]]:
+    """Draw lane markings; the two edges of one become its centre line.
+
+    Args:
+        lanes: Lines, edges or outlines in pixels.
+        size: (height, width).
+        width: Of the drawn line, in pixels of a 1280-pixel wide image.
+        options: Which to draw, and how to pair.
+
+    Returns:
+        (height, width) uint8 {0, 255}; counts of drawn ``pairs``, ``single lines``, ``outlines``; counts of what was
+        left out.
+    """
+    mask = np.zeros(size, np.uint8)
+    drawn: Counter[str] = Counter()
+    dropped: Counter[str] = Counter()
+    factor = size[1] / REFERENCE_WIDTH
+    groups: dict[tuple[str, str, str], list[NDArray[np.float64]]] = collections.defaultdict(list)
+    for lane in lanes:
+        if lane.category == "crosswalk" and not options.crosswalk:
+            dropped["lane: crosswalk"] += 1
+        elif lane.direction == "vertical" and not options.vertical:
+            dropped["lane: across the road"] += 1
+        elif options.lane_categories and lane.category not in options.lane_categories:
+            dropped[f"lane: {lane.category}"] += 1
+        elif lane.closed:
+            fill_polygon(mask, lane.points, 255)
+            drawn["outlines"] += 1
+        elif lane.edge and options.pair_edges:
+            groups[lane.category, lane.style, lane.direction].append(lane.points)
+        else:
+            draw_line(mask, lane.points, width * factor, 255)
+            drawn["single lines"] += 1
+    for edges in groups.values():
+        pairing = pair_edges(edges, options.max_gap * factor)
+        for first, second in pairing.pairs:
+            draw_line(mask, centre_line(edges[first], edges[second]), width * factor, 255)
+        for index in pairing.single:
+            draw_line(mask, edges[index], width * factor, 255)
+        drawn["pairs"] += len(pairing.pairs)
+        drawn["single lines"] += len(pairing.single)
+    return mask, +drawn, dropped
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Job:
+    source: RecordSource
+    split: str
+    root: Path
+    options: ConversionOptions
+
+    def __call__(self, name: str) -> dict[str, Any]:
+        try:
+            return _convert_one(self.source.record(self.split, name), self.split, self.root, self.options)
+        except DataError as error:
+            _logger.warning("%s", error)
+            return {"name": name, "dropped": {"image: labels or image broken": 1}, "error": str(error)}
+
+
+_job: _Job | None = None
+
+
+def _start(job: _Job) -> None:
+    global _job
+    _job = job
+    cv2.setNumThreads(1)
+
+
+def _work(name: str) -> dict[str, Any]:
+    if _job is None:
+        raise RuntimeError("the worker was not started")
+    return _job(name)
+
+
+def _run(
+    source: RecordSource, split: str, names: list[str], root: Path, options: ConversionOptions, workers: int
+) -> Iterator[dict[str, Any]]:
+    job = _Job(source, split, root, options)
+    if workers <= 0 or len(names) < 2:
+        yield from map(job, names)
+        return
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(
+        workers, mp_context=context, initializer=_start, initargs=(job,)
+    ) as pool:
+        yield from pool.map(_work, names, chunksize=max(1, min(32, len(names) // (workers * 4))))
+
+
+def _convert_one(record: ImageRecord, split: str, root: Path, options: ConversionOptions) -> dict[str, Any]:
+    """Write one image and its labels; return its line of the journal."""
+    size = _image_size(record.image)
+    dropped = Counter(record.dropped)
+    summary: dict[str, Any] = {"name": record.name, "attributes": record.attributes, "labelled": []}
+    if record.objects is not None:
+        items, counts = _objects(record.objects, size, options, dropped)
+        content = {
+            "name": record.name,
+            "attributes": record.attributes,
+            "frames": [{"timestamp": 0, "objects": items}],
+        }
+        _write(root / DETECTION_FOLDER / split / f"{record.name}.json", json.dumps(content).encode())
+        summary["labelled"].append("detection")
+        summary["objects"] = dict(sorted(counts.items()))
+    if record.drivable is not None:
+        if isinstance(record.drivable, MaskFile):
+            mask = _mask_of(record.drivable, size, keep_alternative=options.keep_alternative)
+        else:
+            mask = drivable_mask(record.drivable, size, keep_alternative=options.keep_alternative)
+        _write_mask(root / DRIVABLE_FOLDER / split / f"{record.name}.png", mask)
+        summary["labelled"].append("drivable")
+    if record.lane is not None:
+        if isinstance(record.lane, MaskFile):
+            mask = _mask_of(record.lane, size, keep_alternative=False)
+        else:
+            mask, drawn, left_out = lane_mask(record.lane, size, options.width(split), options)
+            dropped += left_out
+            summary["lanes"] = dict(sorted(drawn.items()))
+        _write_mask(root / LANE_FOLDER / split / f"{record.name}.png", mask)
+        summary["labelled"].append("lane")
+    masks = (record.drivable, record.lane)
+    if any(isinstance(mask, MaskFile) and "ignore" in mask.values.values() for mask in masks):
+        summary["ignore_value"] = True
+    summary["dropped"] = dict(sorted(dropped.items()))
+    # The image comes last: where it is, its labels are complete.
+    _place_image(record.image, root / IMAGE_FOLDER / split / f"{record.name}{record.image.suffix.lower()}", options)
+    summary["image"] = f"{record.name}{record.image.suffix.lower()}"
+    return summary
+
+
+def _objects(
+    objects: Iterable[ObjectLabel], size: tuple[int, int], options: ConversionOptions, dropped: Counter[str]
+) -> tuple[list[dict[str, Any]], Counter[str]]:
+    """Return the objects to write, clipped to the image, and how many of each class."""
+    table = class_table(tuple(options.classes), options.classes)
+    names = tuple(options.classes)
+    items: list[dict[str, Any]] = []
+    counts: Counter[str] = Counter()
+    for item in objects:
+        ignored = item.category in options.ignore
+        if item.category not in table and not ignored:
+            dropped[f"object: category {item.category!r} not in a class"] += 1
+            continue
+        x1, y1, x2, y2 = item.box
+        box = (max(x1, 0.0), max(y1, 0.0), min(x2, float(size[1])), min(y2, float(size[0])))
+        if not (box[2] > box[0] and box[3] > box[1]):
+            dropped["object: box empty or outside the image"] += 1
+            continue
+        crowd = item.crowd or ignored
+        counts["ignored" if crowd else names[table[item.category]]] += 1
+        attributes = {**item.attributes, "crowd": True} if crowd else item.attributes
+        # An ignored category keeps its name; a crowd box counts under any class.
+        items.append(
+            {
+                "category": item.category,
+                "id": len(items),
+                "attributes": attributes,
+                "box2d": dict(zip(("x1", "y1", "x2", "y2"), box, strict=True)),
+            }
+        )
+    return items, counts
+
+
+def _mask_of(file: MaskFile, size: tuple[int, int], *, keep_alternative: bool) -> NDArray[np.uint8]:
+    """Return the mask that a picture holds: 255 foreground, 127 alternative if kept apart, 64 ignored."""
+    try:
+        with Image.open(file.path) as picture:
+            picture.load()
+            colours = any(isinstance(value, tuple) for value in file.values)
+            if colours:
+                rgb = np.asarray(picture.convert("RGB")).astype(np.int64)
+                pixels = (rgb[..., 0] << 16) | (rgb[..., 1] << 8) | rgb[..., 2]
+            else:
+                plain = picture if picture.mode in {"P", "L", "I", "I;16", "1"} else picture.convert("L")
+                pixels = np.asarray(plain).astype(np.int64)
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
+        raise DataError(f"{file.path}: not a mask that can be read ({error})") from error
+    if pixels.shape != size:
+        raise DataError(f"{file.path}: mask of {pixels.shape[1]}x{pixels.shape[0]}, image of {size[1]}x{size[0]}")
+    mask = np.zeros(size, np.uint8)
+    for value, meaning in file.values.items():
+        code = (value[0] << 16) | (value[1] << 8) | value[2] if isinstance(value, tuple) else value
+        if meaning == "ignore":
+            level = IGNORE_VALUE
+        else:
+            level = ALTERNATIVE_VALUE if meaning == "alternative" and keep_alternative else 255
+        mask[pixels == code] = level
+    return mask
+
+
+def _image_size(path: Path) -> tuple[int, int]:
+    """Return (height, width) without decoding the pixels."""
+    try:
+        with Image.open(path) as image:
+            width, height = image.size
+            if image.getexif().get(0x0112, 1) in {5, 6, 7, 8}:
+                width, height = height, width
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
+        raise DataError(f"{path}: not an image that can be read ({error})") from error
+    return height, width
+
+
+def _write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
+    _write(path, cv2.imencode(".png", mask)[1].tobytes())
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all, and only if it differs."""
+    try:
+        if path.stat().st_size == len(data) and path.read_bytes() == data:
+            return
+    except FileNotFoundError:
+        pass
+    part = path.with_name(f".{path.name}.part")
+    part.write_bytes(data)
+    part.replace(path)
+
+
+def _rewrite(path: Path, text: str) -> None:
+    _write(path, text.encode())
+
+
+def _place_image(source: Path, target: Path, options: ConversionOptions) -> None:
+    source = source.resolve()
+    if options.images == "symlink":
+        if target.is_symlink() and target.resolve() == source:
+            return
+        target.unlink(missing_ok=True)
+        target.symlink_to(source)
+        return
+    if target.exists():
+        there, here = target.stat(), source.stat()
+        if there.st_ino == here.st_ino or (there.st_size, int(there.st_mtime)) == (here.st_size, int(here.st_mtime)):
+            return
+    part = target.with_name(f".{target.name}.part")
+    part.unlink(missing_ok=True)
+    if options.images == "link":
+        try:
+            os.link(source, part)
+        except OSError:
+            shutil.copy2(source, part)
+    else:
+        shutil.copy2(source, part)
+    part.replace(target)
+
+
+def _open_state(root: Path, options: ConversionOptions) -> Path:
+    """Return the folder of the journals, made if this is a first run.
+
+    Raises:
+        OutputError: If the folder is not of a conversion with these options.
+    """
+    state = root / _STATE_FOLDER
+    text = json.dumps(dataclasses.asdict(options), sort_keys=True, indent=1)
+    path = state / "options.json"
+    if path.is_file():
+        if path.read_text(encoding="utf-8") != text:
+            raise OutputError(f"{root}: holds a conversion with other options; choose another folder or remove it")
+        for part in root.rglob(".*.part"):
+            part.unlink()
+        return state
+    if root.is_dir() and any(root.iterdir()):
+        raise OutputError(f"{root}: is not empty and not of an earlier conversion; choose another folder")
+    state.mkdir(parents=True, exist_ok=True)
+    _rewrite(path, text)
+    return state
+
+
+def _journal_path(state: Path, split: str) -> Path:
+    return state / f"{split}.jsonl"
+
+
+def _read_journal(root: Path, state: Path, split: str, names: set[str]) -> dict[str, dict[str, Any]]:
+    """Return the lines of the images that are done and still there."""
+    path = _journal_path(state, split)
+    if not path.is_file():
+        return {}
+    files = {
+        folder: {entry.name for entry in os.scandir(root / folder / split)}
+        for folder in (IMAGE_FOLDER, DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER)
+    }
+    endings = {
+        "detection": (DETECTION_FOLDER, ".json"),
+        "drivable": (DRIVABLE_FOLDER, ".png"),
+        "lane": (LANE_FOLDER, ".png"),
+    }
+    done: dict[str, dict[str, Any]] = {}
+    lines = path.read_text(encoding="utf-8").splitlines()
+    for line in lines:
+        try:
+            summary = json.loads(line)
+        except ValueError:
+            continue  # the line that an interruption cut off
+        name = summary["name"]
+        if name not in names or "error" in summary or summary["image"] not in files[IMAGE_FOLDER]:
+            continue
+        if all(f"{name}{ending}" in files[folder] for folder, ending in (endings[t] for t in summary["labelled"])):
+            done[name] = summary
+    if lines:
+        _rewrite(path, "".join(json.dumps(summary, sort_keys=True) + "\n" for summary in done.values()))
+    return done
+
+
+def _report(summaries: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> ConversionReport:
+    images: dict[str, int] = {}
+    tables: dict[str, dict[str, Counter[str]]] = {key: {} for key in ("labelled", "objects", "lanes", "dropped")}
+    for split, done in summaries.items():
+        images[split] = sum("image" in summary for summary in done.values())
+        counters = {key: Counter[str]() for key in tables}
+        for summary in done.values():
+            counters["labelled"].update(summary.get("labelled", ()))
+            for key in ("objects", "lanes", "dropped"):
+                counters[key].update(summary.get(key, {}))
+        for key, counter in counters.items():
+            tables[key][split] = counter
+    plain = {key: {split: dict(sorted(c.items())) for split, c in table.items()} for key, table in tables.items()}
+    return ConversionReport(images=images, **plain)
+
+
+def _finish(
+    root: Path, options: ConversionOptions, description: DatasetDescription | None, report: ConversionReport
+) -> None:
+    """Write ``dataset.yaml``, ``index.csv`` and ``conversion.json`` for all splits that are there."""
+    state = root / _STATE_FOLDER
+    rows: list[dict[str, str]] = []
+    columns: list[str] = []
+    ignore: tuple[int, ...] = ()
+    for path in sorted(state.glob("*.jsonl")):
+        for line in path.read_text(encoding="utf-8").splitlines():
+            summary = json.loads(line)
+            if "image" in summary:
+                rows.append({"name": summary["name"], "split": path.stem, **summary["attributes"]})
+                ignore = (IGNORE_VALUE,) if summary.get("ignore_value") else ignore
+                columns += [key for key in summary["attributes"] if key not in columns]
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, ["name", "split", *sorted(columns)], restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    _rewrite(root / "index.csv", text.getvalue())
+    _rewrite(root / "conversion.json", json.dumps(report.to_dict(), indent=1, sort_keys=True))
+    values = {255: "direct", ALTERNATIVE_VALUE: "alternative"} if options.keep_alternative else {255: "drivable"}
+    whole = dataclasses.replace(
+        description or DatasetDescription(name=root.name),
+        classes=dict(options.classes),
+        ignore=options.ignore,
+        splits=tuple(sorted(path.stem for path in state.glob("*.jsonl"))),
+        attributes=tuple(sorted(columns)),
+        drivable=MaskMeaning(values=values, ignore=ignore),
+        lane=MaskMeaning(values={255: "lane marking"}, ignore=ignore),
+    )
+    if not (root / DESCRIPTION_FILE).is_file() or read_description(root) != whole:
+        write_description(root, whole)

@@ -1,0 +1,492 @@
+"""BDD100K as it is downloaded, in both generations of its labels.
+
+1. 2018: one JSON an image (``labels/100k/{split}/NAME.json``: ``frames[0].objects``, categories ``car``,
+   ``area/drivable``, ``lane/single white``), or one a split with the same content in Scalabel form
+   (``bdd100k_labels_images_{split}.json``: ``labels``, categories ``drivable area`` and ``lane`` with ``areaType`` and
+   ``laneType``), and masks as ``drivable_maps/labels/{split}/NAME_drivable_id.png`` or
+   ``drivable_maps/color_labels/{split}/NAME_drivable_color.png``.
+2. 2020: one Scalabel file a task and split (``det_20/det_{split}.json``, ``drivable/polygons/drivable_{split}.json``,
+   ``lane/polygons/lane_{split}.json``), and masks as ``drivable/masks/{split}/NAME.png``,
+   ``drivable/colormaps/{split}/NAME.png`` and ``lane/masks/{split}/NAME.png``.
+
+The folders are found wherever they are below the given one. Files of a whole split run to more than a gigabyte, so
+they are indexed once and each image's part is read when it is wanted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from trilitenet.config import TASKS, Task
+from trilitenet.data.rasterise import flatten
+from trilitenet.data.reading import IMAGE_ENDINGS
+from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel
+from trilitenet.errors import DataError
+
+__all__ = ["BDD100K_SPLITS", "BddSource", "parse_labels", "read_bdd100k"]
+
+BDD100K_SPLITS: Final = ("train", "val", "test")
+
+DRIVABLE_IDS_2018: Final = {1: "direct", 2: "alternative"}
+DRIVABLE_IDS_2020: Final = {0: "direct", 1: "alternative"}
+DRIVABLE_COLOURS: Final[dict[int | tuple[int, int, int], str]] = {
+    (217, 83, 79): "direct",
+    (91, 192, 222): "alternative",
+    (219, 94, 86): "direct",
+    (86, 211, 219): "alternative",
+}
+"""Colours of both generations, as (red, green, blue)."""
+
+_LANE_CATEGORIES: Final = (
+    "crosswalk",
+    "double other",
+    "double white",
+    "double yellow",
+    "road curb",
+    "single other",
+    "single white",
+    "single yellow",
+)
+"""In the order of the lowest three bits of a 2020 lane mask; bit 3 is background, bit 4 dashed, bit 5 vertical."""
+
+_AREA_KINDS: Final = {
+    "area/drivable": "direct",
+    "area/direct": "direct",
+    "area/alternative": "alternative",
+    "direct": "direct",
+    "alternative": "alternative",
+}
+_DOCUMENTS_LOOKED_AT: Final = 300
+_CHUNK = 1 << 24
+_SKIPPED_AREAS: Final = {"area/unknown", "unknown", "background", "area/background"}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Part:
+    """Where an image's entry is in a file of a whole split."""
+
+    path: Path
+    start: int
+    length: int
+
+
+@dataclasses.dataclass(frozen=True)
+class _Split:
+    """What was found for one split."""
+
+    images: dict[str, Path]
+    parts: dict[str, tuple[_Part, ...]]
+    documents: Path | None
+    drivable_masks: tuple[Path, str, dict[int | tuple[int, int, int], str]] | None
+    lane_masks: Path | None
+    tasks: dict[Path, frozenset[Task]]
+
+
+class BddSource:
+    """BDD100K as a `RecordSource`; made by `read_bdd100k`.
+
+    Attributes:
+        found: One line for each thing that was found, for the user.
+    """
+
+    def __init__(
+        self, splits: Mapping[str, _Split], found: tuple[str, ...], *, crosswalk: bool, vertical: bool
+    ) -> None:
+        self._splits = dict(splits)
+        self._crosswalk = crosswalk
+        self._vertical = vertical
+        self.found = found
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        """The splits that have images."""
+        return tuple(self._splits)
+
+    def names(self, split: str) -> list[str]:
+        """Return the names of a split's images, sorted."""
+        return sorted(self._splits[split].images)
+
+    def record(self, split: str, name: str) -> ImageRecord:
+        """Read one image's labels.
+
+        Raises:
+            DataError: If they are broken.
+        """
+        files = self._splits[split]
+        merged = ImageRecord(name, files.images[name])
+        for content, path in _entries(files, name):
+            tasks = files.tasks[files.documents if path.parent == files.documents else path]
+            merged = _merge(merged, parse_labels(content, merged.image, str(path), tasks))
+        if merged.drivable is None and files.drivable_masks is not None:
+            folder, suffix, values = files.drivable_masks
+            mask = folder / f"{name}{suffix}.png"
+            if mask.is_file():
+                merged = dataclasses.replace(merged, drivable=MaskFile(mask, values))
+        if merged.lane is None and files.lane_masks is not None:
+            mask = files.lane_masks / f"{name}.png"
+            if mask.is_file():
+                values = _lane_values(crosswalk=self._crosswalk, vertical=self._vertical)
+                merged = dataclasses.replace(merged, lane=MaskFile(mask, values))
+        return merged
+
+
+def read_bdd100k(raw: str | Path, *, crosswalk: bool = False, vertical: bool = False) -> BddSource:
+    """Find BDD100K's images and labels below a folder.
+
+    Args:
+        raw: The folder, at any level: what is found in it decides.
+        crosswalk: Keep crosswalks when lanes come from masks (with polygons, the conversion decides).
+        vertical: Likewise for markings across the road (stop lines).
+
+    Raises:
+        DataError: If there are no images; the message says what was looked for.
+    """
+    root = Path(raw)
+    if not root.is_dir():
+        raise DataError(f"{root}: no such folder")
+    folders, files = _survey(root)
+    splits: dict[str, _Split] = {}
+    found: list[str] = []
+    for split in BDD100K_SPLITS:
+        images = _images(folders, split)
+        if not images:
+            continue
+        documents = _first(folders, rf"labels/100k/{split}", rf"labels/{split}", rf"100k/{split}", ending=".json")
+        merged = _merged_files(files, split)
+        parts: dict[str, list[_Part]] = {}
+        tasks: dict[Path, frozenset[Task]] = {}
+        for path in merged:
+            seen: set[Task] = set()
+            for name, part, entry in _index(path):
+                parts.setdefault(name, []).append(part)
+                seen |= _tasks_in(entry)
+            tasks[path] = _tasks_of(path) or frozenset(seen)
+        if documents is not None:
+            tasks[documents] = _tasks_of_documents(documents)
+        drivable = _drivable_masks(folders, split)
+        lane = _first(folders, rf"lane/masks/{split}", ending=".png")
+        splits[split] = _Split(
+            images, {name: tuple(items) for name, items in parts.items()}, documents, drivable, lane, tasks
+        )
+        sources = [f"{path.relative_to(root)} ({', '.join(sorted(tasks[path])) or 'nothing'})" for path in tasks]
+        sources += [f"{path.relative_to(root)} (masks)" for path in (drivable and drivable[0], lane) if path]
+        found.append(f"{split}: {len(images)} images; labels from {', '.join(sources) or 'nowhere'}")
+    if not splits:
+        raise DataError(
+            f"{root}: no BDD100K images; looked for folders images/100k/{{train,val,test}} (or images/train, ...) with "
+            ".jpg files at any depth"
+        )
+    return BddSource(splits, tuple(found), crosswalk=crosswalk, vertical=vertical)
+
+
+def parse_labels(content: Any, image: Path, source: str, tasks: Collection[Task] = TASKS) -> ImageRecord:
+    """Read one image's entry, of either generation.
+
+    Args:
+        content: The parsed JSON.
+        image: The image's file.
+        source: Where it came from, for messages.
+        tasks: What the file labels: an entry without objects of these is labelled, with nothing in it.
+
+    Raises:
+        DataError: If it is neither form.
+    """
+    if not isinstance(content, dict):
+        raise DataError(f"{source}: an image's entry must be an object, got {type(content).__name__}")
+    frames = content.get("frames")
+    if frames is not None:
+        items = [item for frame in frames for item in (frame.get("objects") or ())]
+    elif "labels" in content or "name" in content:
+        items = content.get("labels") or []
+    else:
+        raise DataError(f"{source}: neither 'frames' (2018, one file an image) nor 'labels' (Scalabel) in the entry")
+    objects: list[ObjectLabel] = []
+    areas: list[AreaLabel] = []
+    lanes: list[LaneLabel] = []
+    dropped: Counter[str] = Counter()
+    try:
+        for item in items:
+            _parse_item(item, objects, areas, lanes, dropped)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise DataError(f"{source}: {image.stem}: {error!r} is not as BDD100K has it") from error
+    attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
+    return ImageRecord(
+        name=image.stem,
+        image=image,
+        objects=tuple(objects) if "detection" in tasks else None,
+        drivable=tuple(areas) if "drivable" in tasks else None,
+        lane=tuple(lanes) if "lane" in tasks else None,
+        attributes=attributes,
+        dropped=dict(dropped),
+    )
+
+
+def _parse_item(
+    item: dict[str, Any],
+    objects: list[ObjectLabel],
+    areas: list[AreaLabel],
+    lanes: list[LaneLabel],
+    dropped: Counter[str],
+) -> None:
+    category = str(item["category"])
+    attributes = item.get("attributes") or {}
+    if item.get("box2d") is not None:
+        box = item["box2d"]
+        corners = (float(box["x1"]), float(box["y1"]), float(box["x2"]), float(box["y2"]))
+        crowd = bool(attributes.get("crowd", False) or attributes.get("ignored", False))
+        kept = {str(k): v for k, v in attributes.items() if isinstance(v, (str, bool, int, float))}
+        objects.append(ObjectLabel(category, corners, crowd, kept))
+    elif item.get("poly2d"):
+        kind = _area_kind(category, attributes)
+        if kind is None and not _is_lane(category):
+            dropped[f"polygon of category {category!r}"] += 1
+            return
+        for vertices, types, closed in _polygons(item["poly2d"], closed=kind is not None):
+            if len(vertices) < (3 if closed else 2):
+                dropped[f"{'area' if kind else 'lane'} with too few points"] += 1
+                continue
+            points = flatten(vertices, types, closed=closed)
+            if kind is not None:
+                areas.append(AreaLabel(kind, points))
+                continue
+            lane_type = str(attributes.get("laneType") or attributes.get("laneTypes") or category.removeprefix("lane/"))
+            lanes.append(
+                LaneLabel(
+                    category=lane_type if category == "lane" or category.startswith("lane/") else category,
+                    points=points,
+                    closed=closed,
+                    style=str(attributes.get("laneStyle") or attributes.get("style") or ""),
+                    direction=str(attributes.get("laneDirection") or attributes.get("direction") or ""),
+                    edge=not closed,
+                )
+            )
+    else:
+        dropped[f"label without shape of category {category!r}"] += 1
+
+
+def _area_kind(category: str, attributes: Mapping[str, Any]) -> str | None:
+    """Return ``direct``, ``alternative``, or None if it is no drivable area."""
+    if category == "drivable area":
+        return _AREA_KINDS.get(str(attributes.get("areaType", "direct")))
+    return None if category in _SKIPPED_AREAS else _AREA_KINDS.get(category)
+
+
+def _polygons(poly2d: Any, *, closed: bool) -> Iterator[tuple[list[list[float]], str, bool]]:
+    """Yield (vertices, types, closed) of a ``poly2d`` of either generation."""
+    if isinstance(poly2d[0], dict):
+        for shape in poly2d:
+            yield shape["vertices"], str(shape.get("types") or ""), bool(shape.get("closed", closed))
+    else:
+        yield (
+            [[float(x), float(y)] for x, y, *_ in poly2d],
+            "".join(str(point[2]) if len(point) > 2 else "L" for point in poly2d),
+            closed,
+        )
+
+
+def _merge(one: ImageRecord, two: ImageRecord) -> ImageRecord:
+    """Join two records of an image; what the first lacks comes from the second."""
+    return dataclasses.replace(
+        one,
+        objects=two.objects if one.objects is None else one.objects,
+        drivable=two.drivable if one.drivable is None else one.drivable,
+        lane=two.lane if one.lane is None else one.lane,
+        attributes=two.attributes | one.attributes,
+        dropped=dict(Counter(one.dropped) + Counter(two.dropped)),
+    )
+
+
+def _entries(files: _Split, name: str) -> Iterator[tuple[Any, Path]]:
+    for part in files.parts.get(name, ()):
+        with part.path.open("rb") as file:
+            file.seek(part.start)
+            yield json.loads(file.read(part.length)), part.path
+    if files.documents is not None:
+        path = files.documents / f"{name}.json"
+        try:
+            text = path.read_bytes()
+        except FileNotFoundError:
+            return
+        try:
+            yield json.loads(text), path
+        except ValueError as error:
+            raise DataError(f"{path}: not JSON ({error})") from error
+
+
+def _tasks_of(path: Path) -> frozenset[Task]:
+    """Return the task that a file of a whole split is about, by its name; empty = its name does not tell."""
+    match = re.fullmatch(r"(det|drivable|lane)_(train|val|test)\.json", path.name)
+    if match is None:
+        return frozenset()
+    names: dict[str, Task] = {"det": "detection", "drivable": "drivable", "lane": "lane"}
+    return frozenset({names[match[1]]})
+
+
+def _tasks_in(entry: Any) -> set[Task]:
+    """Return the tasks that an image's entry has labels of."""
+    tasks: set[Task] = set()
+    frames = entry.get("frames")
+    items = entry.get("labels") or [item for frame in frames or () for item in frame.get("objects") or ()]
+    for item in items:
+        category = str(item.get("category"))
+        if item.get("box2d") is not None:
+            tasks.add("detection")
+        elif category == "drivable area" or category in _AREA_KINDS:
+            tasks.add("drivable")
+        elif _is_lane(category):
+            tasks.add("lane")
+    return tasks
+
+
+def _tasks_of_documents(folder: Path) -> frozenset[Task]:
+    """Return the tasks that one-an-image files label: those that the first few hundred have labels of."""
+    tasks: set[Task] = set()
+    for path in sorted(folder.glob("*.json"))[:_DOCUMENTS_LOOKED_AT]:
+        if len(tasks) == len(TASKS):
+            break
+        try:
+            entry = json.loads(path.read_bytes())
+        except ValueError:
+            continue
+        if isinstance(entry, dict):
+            tasks |= _tasks_in(entry)
+    return frozenset(tasks)
+
+
+def _is_lane(category: str) -> bool:
+    return category == "lane" or category.startswith("lane/") or category in _LANE_CATEGORIES
+
+
+def _merged_files(files: list[Path], split: str) -> list[Path]:
+    """Return the files of a whole split, the newest generation first."""
+    patterns = (
+        rf"(^|/)det_{split}\.json$",
+        rf"(^|/)drivable_{split}\.json$",
+        rf"(^|/)lane_{split}\.json$",
+        rf"(^|/)bdd100k_labels_images_(100k_)?{split}\.json$",
+        rf"(^|/)bdd100k_labels_images_{split}_100k\.json$",
+    )
+    found = []
+    for pattern in patterns:
+        matching = sorted(path for path in files if re.search(pattern, path.as_posix()))
+        if matching:
+            found.append(matching[-1])
+    return found
+
+
+def _index(path: Path) -> Iterator[tuple[str, _Part, dict[str, Any]]]:
+    """Yield (image name, where its entry is, the entry) for a list of entries, or an object whose ``frames`` is one."""
+    decoder = json.JSONDecoder()
+    with path.open("rb") as file:
+        # Latin-1 keeps one character a byte, so that positions in the text are positions in the file.
+        text = file.read(_CHUNK).decode("latin-1")
+        base = 0
+        position = _list_start(text, path)
+        while True:
+            while position < len(text) and text[position] in " \t\r\n,":
+                position += 1
+            if position >= len(text) or len(text) - position < 2:
+                more = file.read(_CHUNK).decode("latin-1")
+                if not more and (position >= len(text) or text[position] != "]"):
+                    raise DataError(f"{path}: ends in the middle of its list; download it again")
+                text, base, position = text[position:] + more, base + position, 0
+            if text[position] == "]":
+                return
+            if text[position] in " \t\r\n,":
+                continue
+            try:
+                entry, end = decoder.raw_decode(text, position)
+            except json.JSONDecodeError as error:
+                more = file.read(_CHUNK).decode("latin-1")
+                if not more:
+                    raise DataError(f"{path}: not JSON near byte {base + position} ({error.msg})") from error
+                text, base, position = text[position:] + more, base + position, 0
+                continue
+            if not isinstance(entry, dict) or "name" not in entry:
+                raise DataError(f"{path}: an entry without 'name' near byte {base + position}")
+            yield Path(str(entry["name"])).stem, _Part(path, base + position, end - position), entry
+            position = end
+
+
+def _list_start(text: str, path: Path) -> int:
+    """Return the position after the ``[`` of the list of entries."""
+    match = re.match(r"\s*\[", text) or re.match(r"\s*\{.*?\"frames\"\s*:\s*\[", text, re.DOTALL)
+    if match is None:
+        raise DataError(f"{path}: neither a list of images nor an object with 'frames'")
+    return match.end()
+
+
+def _survey(root: Path) -> tuple[dict[str, Path], list[Path]]:
+    """Return all folders by their path from the root, and all JSON files that may hold a whole split."""
+    folders: dict[str, Path] = {}
+    files: list[Path] = []
+    for folder, names, entries in os.walk(root, followlinks=True):
+        names.sort()
+        names[:] = [name for name in names if not name.startswith(".")]
+        path = Path(folder)
+        folders[path.relative_to(root).as_posix()] = path
+        files += [
+            path / name
+            for name in entries
+            if name.endswith(".json") and ("train" in name or "val" in name or "test" in name)
+        ]
+    return folders, files
+
+
+def _images(folders: dict[str, Path], split: str) -> dict[str, Path]:
+    """Return image name -> path of a split."""
+    for pattern in (rf"images/100k/{split}", rf"100k/{split}", rf"images/{split}", rf"{split}"):
+        images: dict[str, Path] = {}
+        for where, folder in folders.items():
+            if re.search(rf"(^|/){pattern}$", where) and "label" not in where:
+                for entry in os.scandir(folder):
+                    if entry.name.lower().endswith(IMAGE_ENDINGS[:2]):
+                        images[Path(entry.name).stem] = Path(entry.path)
+        if images:
+            return images
+    return {}
+
+
+def _first(folders: dict[str, Path], *patterns: str, ending: str) -> Path | None:
+    """Return the first folder that ends in one of the patterns and holds a file with that ending."""
+    for pattern in patterns:
+        for where, folder in folders.items():
+            if re.search(rf"(^|/){pattern}$", where):
+                with os.scandir(folder) as entries:
+                    if any(entry.name.endswith(ending) for entry in entries):
+                        return folder
+    return None
+
+
+def _drivable_masks(
+    folders: dict[str, Path], split: str
+) -> tuple[Path, str, dict[int | tuple[int, int, int], str]] | None:
+    """Return (folder, what follows the name, what the values mean) of the drivable masks there are."""
+    kinds: tuple[tuple[str, str, dict[Any, str]], ...] = (
+        (rf"drivable/masks/{split}", "", DRIVABLE_IDS_2020),
+        (rf"drivable/colormaps/{split}", "", DRIVABLE_COLOURS),
+        (rf"drivable_maps/labels/{split}", "_drivable_id", DRIVABLE_IDS_2018),
+        (rf"drivable_maps/color_labels/{split}", "_drivable_color", DRIVABLE_COLOURS),
+    )
+    for pattern, suffix, values in kinds:
+        folder = _first(folders, pattern, ending=f"{suffix}.png")
+        if folder is not None:
+            return folder, suffix, dict(values)
+    return None
+
+
+def _lane_values(*, crosswalk: bool, vertical: bool) -> dict[int | tuple[int, int, int], str]:
+    """Return the values of a 2020 lane mask that count as marking."""
+    values: dict[int | tuple[int, int, int], str] = {}
+    for value in range(64):
+        if value & 8 or (value & 32 and not vertical) or (not value & 7 and not crosswalk):
+            continue
+        values[value] = "foreground"
+    return values

@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.data import raw_bdd
+from trilitenet.data.converting import ConversionOptions, convert
+from trilitenet.data.reading import DrivingDataset
+from trilitenet.errors import DataError
+from trilitenet.formats.scalabel import parse_labels, read_bdd100k
+
+OPTIONS = ConversionOptions(lane_width={"*": raw_bdd.WIDTH_AT_1280}, max_gap=100.0)
+
+FORMS: dict[str, Callable[[Path], None]] = {
+    "2018 one file an image": raw_bdd.write_2018_documents,
+    "2018 merged": raw_bdd.write_2018_merged,
+    "2020": raw_bdd.write_2020,
+}
+
+
+@pytest.fixture(params=FORMS)
+def raw(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    root = tmp_path / "bdd100k"
+    raw_bdd.write_images(root)
+    FORMS[request.param](root)
+    return root
+
+
+def test_masks_agree_pixel_for_pixel(raw: Path, tmp_path: Path) -> None:
+    report = convert(read_bdd100k(raw), tmp_path / "out", OPTIONS)
+    drivable = cv2.imread(str(tmp_path / "out/da_seg_annotations/train/a1.png"), cv2.IMREAD_UNCHANGED)
+    lane = cv2.imread(str(tmp_path / "out/ll_seg_annotations/train/a1.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(drivable, raw_bdd.drivable_truth())
+    np.testing.assert_array_equal(lane, raw_bdd.lane_truth())
+    assert report.images == {"train": 2, "val": 1}
+    assert report.lanes["train"] == {"pairs": 2, "single lines": 1}
+    assert report.dropped["train"]["lane: crosswalk"] == 1
+    assert report.dropped["train"]["lane: across the road"] == 1
+    assert report.dropped["train"]["object: box empty or outside the image"] == 1
+
+
+def test_boxes_and_attributes(raw: Path, tmp_path: Path) -> None:
+    report = convert(read_bdd100k(raw), tmp_path / "out", OPTIONS)
+    sample = DrivingDataset(tmp_path / "out", "train")[0]
+    assert sample.name == "a1"
+    assert sample.boxes is not None
+    np.testing.assert_array_equal(sample.boxes[0], [50, 20, 64, 30])
+    assert len(sample.boxes) == 4  # car, truck, bus, train
+    assert report.objects["train"] == {"vehicle": 4}
+    assert raw_bdd.ATTRIBUTES.items() <= sample.attributes.items()
+    assert sum(count for reason, count in report.dropped["train"].items() if "not in a class" in reason) == 6
+
+
+def test_missing_labels_stay_missing(raw: Path, tmp_path: Path) -> None:
+    convert(read_bdd100k(raw), tmp_path / "out", OPTIONS)
+    sample = DrivingDataset(tmp_path / "out", "train")[1]
+    assert sample.boxes is None
+    assert sample.drivable is None
+    if (raw / "labels/lane").exists():
+        # The 2020 lane file lists a2 without labels: labelled, and no marking in it.
+        assert sample.lane is not None
+        assert not sample.lane.any()
+    else:
+        assert sample.lane is None
+
+
+@pytest.mark.parametrize("kind", ["ids 2018", "ids 2020", "colours 2018", "colours 2020"])
+@pytest.mark.parametrize("keep", [False, True])
+def test_drivable_masks_of_every_kind(tmp_path: Path, kind: str, keep: bool) -> None:
+    raw = tmp_path / "raw"
+    raw_bdd.write_images(raw)
+    raw_bdd.write_2020(raw, polygons=False, masks=kind)
+    options = ConversionOptions(keep_alternative=keep)
+    convert(read_bdd100k(raw), tmp_path / "out", options)
+    mask = cv2.imread(str(tmp_path / "out/da_seg_annotations/train/a1.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(mask, raw_bdd.drivable_truth(alternative=127 if keep else 255))
+    dataset = DrivingDataset(tmp_path / "out", "train")
+    np.testing.assert_array_equal(dataset[0].drivable, raw_bdd.drivable_truth() // 255)
+    assert dataset.description.drivable.values == ({255: "direct", 127: "alternative"} if keep else {255: "drivable"})
+    assert dataset[1].drivable is None
+
+
+def test_polygons_can_keep_two_areas(raw: Path, tmp_path: Path) -> None:
+    convert(read_bdd100k(raw), tmp_path / "out", ConversionOptions(keep_alternative=True))
+    mask = cv2.imread(str(tmp_path / "out/da_seg_annotations/train/a1.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(mask, raw_bdd.drivable_truth(alternative=127))
+
+
+def test_crosswalks_and_stop_lines_by_option(raw: Path, tmp_path: Path) -> None:
+    both = ConversionOptions(lane_width={"*": raw_bdd.WIDTH_AT_1280}, max_gap=100.0, crosswalk=True, vertical=True)
+    convert(read_bdd100k(raw), tmp_path / "out", both)
+    lane = cv2.imread(str(tmp_path / "out/ll_seg_annotations/train/a1.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(lane, raw_bdd.lane_truth(crosswalk=True, vertical=True))
+
+
+def test_lane_masks_of_2020_are_read_where_there_are_no_polygons(tmp_path: Path) -> None:
+    raw = tmp_path / "raw"
+    raw_bdd.write_images(raw)
+    raw_bdd.write_2020(raw, polygons=False)
+    folder = raw / "labels/lane/masks/train"
+    folder.mkdir(parents=True)
+    mask = np.full(raw_bdd.SIZE, 255, np.uint8)
+    mask[1] = 0  # crosswalk
+    mask[2] = 6 | 16  # single white, dashed
+    mask[3] = 6 | 32  # single white across the road
+    cv2.imwrite(str(folder / "a1.png"), mask)
+    convert(read_bdd100k(raw), tmp_path / "out")
+    lane = cv2.imread(str(tmp_path / "out/ll_seg_annotations/train/a1.png"), cv2.IMREAD_UNCHANGED)
+    assert np.flatnonzero(lane.any(axis=1)).tolist() == [2]
+
+
+def test_index_of_a_large_file_survives_chunk_borders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    raw = tmp_path / "raw"
+    raw_bdd.write_images(raw)
+    raw_bdd.write_2018_merged(raw)
+    whole = read_bdd100k(raw).record("train", "a1")
+    monkeypatch.setattr("trilitenet.formats.scalabel._CHUNK", 61)
+    pieces = read_bdd100k(raw).record("train", "a1")
+    assert pieces.objects == whole.objects
+
+
+def test_errors_name_the_file(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such folder"):
+        read_bdd100k(tmp_path / "nowhere")
+    with pytest.raises(DataError, match="no BDD100K images"):
+        read_bdd100k(tmp_path)
+    raw_bdd.write_images(tmp_path)
+    raw_bdd.write_2018_merged(tmp_path)
+    path = tmp_path / "labels/bdd100k_labels_images_train.json"
+    path.write_text(path.read_text()[:-40])
+    with pytest.raises(DataError, match=r"bdd100k_labels_images_train\.json"):
+        read_bdd100k(tmp_path)
+    path.write_text('"hello"')
+    with pytest.raises(DataError, match="neither a list"):
+        read_bdd100k(tmp_path)
+    with pytest.raises(DataError, match="neither 'frames'"):
+        parse_labels({"hello": 1}, Path("x.jpg"), "x.json")
+    with pytest.raises(DataError, match="not as BDD100K has it"):
+        parse_labels({"labels": [{"category": "car", "box2d": {"x1": 1}}]}, Path("x.jpg"), "x.json")
+
+
+def test_a_broken_document_is_counted_and_the_rest_converted(tmp_path: Path) -> None:
+    raw = tmp_path / "raw"
+    raw_bdd.write_images(raw)
+    raw_bdd.write_2018_documents(raw)
+    (raw / "labels/100k/train/a2.json").write_text(json.dumps({"name": "a2"})[:-3])
+    report = convert(read_bdd100k(raw), tmp_path / "out")
+    assert report.images == {"train": 1, "val": 1}
+    assert report.dropped["train"]["image: labels or image broken"] == 1
