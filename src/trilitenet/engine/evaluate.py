@@ -1,23 +1,36 @@
-"""Evaluate any predictor on any labelled images: PyTorch, ONNX and INT8 are scored by the same lines."""
+"""Evaluate any predictor on any labelled images: PyTorch, ONNX and INT8 are scored by the same lines.
+
+    report = evaluate(predictor, dataset)                    # protocol="fair"
+    report.fair.drivable.miou, report.fair.lane.f1, report.fair.detection.ap50
+    sys.stdout.write(report.summary())
+
+Reading goes ahead in one thread and scoring follows in another, so that on two cores both mostly hide behind the
+network. Memory does not grow with the number of images beyond a few dozen numbers each.
+"""
 
 from __future__ import annotations
 
 import collections
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+import datetime
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import ModelCard, Thresholds
-from trilitenet.engine.scoring import FairMetrics, FairScores, LabelledImage
-from trilitenet.errors import DataError
+from trilitenet.config import ModelCard, Task, Thresholds
+from trilitenet.engine.provenance import describe_hardware, describe_versions, peak_memory
+from trilitenet.engine.report import Provenance, Report
+from trilitenet.engine.scorecard import CONDITIONS, PAPER_THRESHOLDS, Scorecard, protocols_of
+from trilitenet.engine.scoring import CanvasPrediction, LabelledImage
+from trilitenet.errors import ConfigError, DataError
 from trilitenet.metrics.detection import DetectionMetric
 from trilitenet.processing.letterbox import Letterbox
-from trilitenet.processing.postprocess import select_boxes, to_perceptions
-from trilitenet.structures import RawOutputs
+from trilitenet.processing.postprocess import select_boxes, threshold_mask
+from trilitenet.structures import Boxes, Perception, RawOutputs
 
 __all__ = [
     "LOWEST_CONFIDENCE",
@@ -26,18 +39,30 @@ __all__ = [
     "LabelledImages",
     "best_thresholds",
     "evaluate",
+    "provenance_now",
 ]
 
 LOWEST_CONFIDENCE: Final = 0.001
 """Boxes down to this confidence are scored (the published one); average precision needs the doubtful ones too."""
 
+Prediction = tuple[Perception | None, CanvasPrediction | None]
+ImageChange = Callable[[NDArray[np.uint8], str], NDArray[np.uint8]]
+"""Given an (H, W, 3) uint8 RGB image and its name, returns the image to show to the network, of the same size."""
 
-class _Backend(Protocol):
+
+class RunsBatches(Protocol):
+    """What evaluation needs of a backend."""
+
     @property
-    def card(self) -> ModelCard: ...
+    def card(self) -> ModelCard:
+        """What the network is."""
+
     @property
-    def name(self) -> str: ...
-    def run(self, batch: NDArray[np.uint8]) -> RawOutputs: ...
+    def name(self) -> str:
+        """The runtime and the device."""
+
+    def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
+        """Run the network on (B, H, W, 3) uint8 RGB, letterboxed."""
 
 
 class EvaluatedPredictor(Protocol):
@@ -46,7 +71,7 @@ class EvaluatedPredictor(Protocol):
     thresholds: Thresholds
 
     @property
-    def backend(self) -> _Backend:
+    def backend(self) -> RunsBatches:
         """The network on a runtime."""
 
     def preprocess(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Letterbox]:
@@ -68,17 +93,185 @@ def evaluate(
     predictor: EvaluatedPredictor,
     dataset: LabelledImages,
     *,
+    protocol: str = "fair",
     batch_size: int = 1,
     limit: int | None = None,
-) -> FairScores:
-    """Score a predictor."""
+    resamples: int = 1000,
+    seed: int = 0,
+    worst: int = 24,
+    by: Sequence[str] = CONDITIONS,
+    paper_batch: int = 16,
+    change: ImageChange | None = None,
+    on_prediction: Callable[[LabelledImage, Perception], None] | None = None,
+    about: Mapping[str, Any] | None = None,
+) -> Report:
+    """Score a predictor on labelled images.
+
+    Args:
+        predictor: Its thresholds decide masks, and state the confidence of precision, recall and F1.
+        dataset: In the order that batches of the 'paper' protocol are made of: by name.
+        protocol: ``"fair"``, ``"paper"`` or ``"both"``.
+        batch_size: At most so many images of one size go through the network at once; figures do not hang on it.
+        limit: Only the first so many images.
+        resamples: Bootstrap draws for the 95% intervals; 0 for none.
+        seed: Of the draws.
+        worst: How many of the worst images to keep pictures of, a task; 0 for none.
+        by: Attributes to make tables by.
+        paper_batch: Images a batch of the published averages.
+        change: Alters each image before the network sees it (corruptions); labels stay.
+        on_prediction: Called with every image and its prediction in pixels of the image, in order.
+        about: Fields of `Provenance` that only the caller knows: ``model``, ``model_sha256``, ``data``, ``split``,
+            ``data_sha256``, ``settings``.
+
+    Raises:
+        ConfigError: If there is no such protocol, or the classes of model and data differ.
+        DataError: If there are no images.
+    """
     card = predictor.backend.card
-    metrics = FairMetrics(card.class_names, card.tasks, confidence=predictor.thresholds.confidence)
-    low = dataclasses.replace(predictor.thresholds, confidence=LOWEST_CONFIDENCE)
-    for samples, letterboxes, raw in _outputs(predictor, dataset, batch_size, limit):
-        for sample, prediction in zip(samples, to_perceptions(raw, letterboxes, low, card.class_names), strict=True):
-            metrics.update(sample, prediction)
-    return metrics.compute()
+    check_classes(card, dataset)
+    protocols = protocols_of(protocol)
+    scorecard = Scorecard(
+        card.class_names,
+        card.tasks,
+        protocol=protocol,
+        confidence=predictor.thresholds.confidence,
+        paper_batch=paper_batch,
+        worst=worst,
+        by=by,
+    )
+    started = time.time()
+    canvases: dict[tuple[int, int], None] = {}
+
+    def score(sample: LabelledImage, prediction: Prediction) -> None:
+        scorecard.add(sample, *prediction)
+        if on_prediction is not None and prediction[0] is not None:
+            on_prediction(sample, prediction[0])
+
+    native = "fair" in protocols or on_prediction is not None
+    with _InOrder() as scoring:
+        for samples, letterboxes, raw in _outputs(predictor, dataset, batch_size, limit, change):
+            canvases.update(dict.fromkeys(letterbox.canvas for letterbox in letterboxes))
+            for index, (sample, letterbox) in enumerate(zip(samples, letterboxes, strict=True)):
+                scoring.submit(
+                    _score_one, score, sample, raw, index, letterbox, predictor.thresholds, card, native, protocols
+                )
+    return scorecard.report(
+        lambda images: provenance_now(
+            images,
+            started,
+            {
+                "model": card.variant,
+                "runtime": predictor.backend.name,
+                "thresholds": dataclasses.asdict(predictor.thresholds),
+                "canvas": tuple(f"{width}x{height}" for height, width in canvases),
+                "settings": _settings(protocols, paper_batch, resamples, seed),
+                **(about or {}),
+            },
+        ),
+        resamples=resamples,
+        seed=seed,
+    )
+
+
+def check_classes(card: ModelCard, dataset: LabelledImages) -> None:
+    """Refuse labels whose class ids mean something else than the model's.
+
+    Raises:
+        ConfigError: If there are several classes and their names differ.
+    """
+    names = tuple(dataset.class_names)
+    if "detection" in card.tasks and names != card.class_names and max(len(names), card.classes) > 1:
+        raise ConfigError(
+            f"the model has classes {', '.join(card.class_names)}, the labels {', '.join(names)}; "
+            "read the data set with the model's classes"
+        )
+
+
+def _settings(protocols: Sequence[str], paper_batch: int, resamples: int, seed: int) -> dict[str, Any]:
+    settings: dict[str, Any] = {
+        "protocols": list(protocols),
+        "lowest_confidence": LOWEST_CONFIDENCE,
+        "resamples": resamples,
+        "seed": seed,
+    }
+    return settings | ({"paper_batch": paper_batch} if "paper" in protocols else {})
+
+
+def provenance_now(images: int, started: float, about: Mapping[str, Any]) -> Provenance:
+    """Complete what is known of a run with versions, hardware, time and memory.
+
+    Args:
+        images: How many images were scored.
+        started: `time.time` at the start.
+        about: Fields of `Provenance`.
+    """
+    fields: dict[str, Any] = {
+        "model": "",
+        "model_sha256": None,
+        "runtime": "",
+        "data": "",
+        "split": "",
+        "data_sha256": {},
+        "thresholds": {},
+        "settings": {},
+        "canvas": (),
+        **about,
+    }
+    return Provenance(
+        **fields,
+        images=images,
+        versions=dict(describe_versions()),
+        hardware=describe_hardware(),
+        started=datetime.datetime.fromtimestamp(started, datetime.timezone.utc).isoformat(timespec="seconds"),
+        seconds=round(time.time() - started, 3),
+        peak_memory_mib=round(peak_memory(), 1),
+    )
+
+
+def _score_one(
+    score: Callable[[LabelledImage, Prediction], None],
+    sample: LabelledImage,
+    raw: RawOutputs,
+    index: int,
+    letterbox: Letterbox,
+    thresholds: Thresholds,
+    card: ModelCard,
+    native: bool,
+    protocols: Sequence[str],
+) -> None:
+    low = dataclasses.replace(thresholds, confidence=min(LOWEST_CONFIDENCE, thresholds.confidence))
+    boxes = paper_boxes = None
+    if raw.detection is not None:
+        boxes = select_boxes(raw.detection[index], letterbox, low) if native else None
+        if "paper" in protocols:
+            same = boxes is not None and (low.confidence, low.iou, low.max_boxes) == (
+                PAPER_THRESHOLDS.confidence,
+                PAPER_THRESHOLDS.iou,
+                PAPER_THRESHOLDS.max_boxes,
+            )
+            paper_boxes = boxes if same else select_boxes(raw.detection[index], letterbox, PAPER_THRESHOLDS)
+    perception = canvas = None
+    if native:
+        perception = Perception(
+            size=letterbox.source,
+            class_names=card.class_names,
+            boxes=boxes,
+            drivable=None if raw.drivable is None else threshold_mask(raw.drivable[index], letterbox, low.drivable),
+            lane=None if raw.lane is None else threshold_mask(raw.lane[index], letterbox, low.lane),
+        )
+    if "paper" in protocols:
+        canvas = CanvasPrediction(
+            boxes=paper_boxes,
+            drivable=_argmax(raw.drivable, index, letterbox),
+            lane=_argmax(raw.lane, index, letterbox),
+            letterbox=letterbox,
+        )
+    score(sample, (perception, canvas))
+
+
+def _argmax(masks: NDArray[np.uint8] | None, index: int, letterbox: Letterbox) -> NDArray[np.bool_] | None:
+    """Decide by the likelier of the two classes, inside the padding."""
+    return None if masks is None else np.asarray(masks[index][letterbox.inside] > 127)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,24 +301,41 @@ def best_thresholds(
 
     Args:
         predictor: Its own thresholds stay where there is nothing to tell from.
-        dataset: Labelled images; a split that is reported on as held out must not be used.
+        dataset: Labelled images; not those that are reported on as held out.
         batch_size: At most so many images go through the network at once.
         limit: Only the first so many images.
+
+    Raises:
+        ConfigError: If the classes of model and data differ.
+        DataError: If there are no images.
     """
     card = predictor.backend.card
+    check_classes(card, dataset)
     low = dataclasses.replace(predictor.thresholds, confidence=LOWEST_CONFIDENCE)
     detection = DetectionMetric(card.class_names)
-    counts = {task: np.zeros((2, 256), np.int64) for task in ("drivable", "lane")}
-    for samples, letterboxes, raw in _outputs(predictor, dataset, batch_size, limit):
-        for index, (sample, letterbox) in enumerate(zip(samples, letterboxes, strict=True)):
-            if raw.detection is not None:
-                boxes = select_boxes(raw.detection[index], letterbox, low)
-                detection.update(
-                    boxes.xyxy, boxes.confidence, boxes.class_id, sample.boxes, sample.class_id, sample.ignored
-                )
-            for task, masks, truth in (("drivable", raw.drivable, sample.drivable), ("lane", raw.lane, sample.lane)):
-                if masks is not None and truth is not None:
-                    counts[task] += _probability_counts(letterbox.mask_to_source(masks[index]), truth, sample.valid)
+    counts: dict[Task, NDArray[np.int64]] = {
+        "drivable": np.zeros((2, 256), np.int64),
+        "lane": np.zeros((2, 256), np.int64),
+    }
+
+    def look(sample: LabelledImage, raw: RawOutputs, index: int, letterbox: Letterbox) -> None:
+        if raw.detection is not None:
+            boxes: Boxes = select_boxes(raw.detection[index], letterbox, low)
+            detection.update(
+                boxes.xyxy, boxes.confidence, boxes.class_id, sample.boxes, sample.class_id, sample.ignored
+            )
+        pairs: tuple[tuple[Task, NDArray[np.uint8] | None, NDArray[np.uint8] | None], ...] = (
+            ("drivable", raw.drivable, sample.drivable),
+            ("lane", raw.lane, sample.lane),
+        )
+        for task, masks, truth in pairs:
+            if masks is not None and truth is not None:
+                counts[task] += _probability_counts(letterbox.mask_to_source(masks[index]), truth, sample.valid)
+
+    with _InOrder() as looking:
+        for samples, letterboxes, raw in _outputs(predictor, dataset, batch_size, limit, None):
+            for index, (sample, letterbox) in enumerate(zip(samples, letterboxes, strict=True)):
+                looking.submit(look, sample, raw, index, letterbox)
     drivable, drivable_iou = _best_cut(counts["drivable"], predictor.thresholds.drivable)
     lane, lane_iou = _best_cut(counts["lane"], predictor.thresholds.lane)
     confidence, f1 = _best_confidence(detection, predictor.thresholds.confidence)
@@ -141,7 +351,7 @@ def _probability_counts(
     probability: NDArray[np.uint8], truth: NDArray[np.uint8], valid: NDArray[np.bool_] | None
 ) -> NDArray[np.int64]:
     """Return (2, 256) pixels by truth and by probability x 255."""
-    joint = probability.astype(np.uint16) + (truth.astype(np.uint16) << 8)
+    joint = probability.astype(np.uint16) + ((truth > 0).astype(np.uint16) << np.uint16(8))
     picked = joint.ravel() if valid is None else joint[valid]
     return np.bincount(picked, minlength=512).reshape(2, 256)
 
@@ -158,8 +368,7 @@ def _best_cut(counts: NDArray[np.int64], default: float) -> tuple[float, float]:
 
 
 def _best_confidence(detection: DetectionMetric, default: float) -> tuple[float, float]:
-    curve = detection.curve()
-    best = detection.compute().best
+    curve, best = detection.curve(), detection.compute().best
     if not len(curve.confidence) or np.isnan(best.f1):
         return default, float("nan")
     at = int(np.flatnonzero(curve.confidence == best.confidence)[0])
@@ -171,17 +380,26 @@ _Outputs = tuple[list[LabelledImage], list[Letterbox], RawOutputs]
 
 
 def _outputs(
-    predictor: EvaluatedPredictor, dataset: LabelledImages, batch_size: int, limit: int | None
+    predictor: EvaluatedPredictor,
+    dataset: LabelledImages,
+    batch_size: int,
+    limit: int | None,
+    change: ImageChange | None,
 ) -> Iterator[_Outputs]:
-    """Yield samples with what the network makes of them; reading goes on in a second thread meanwhile."""
+    """Yield samples with what the network makes of them; reading and letterboxing go ahead in a second thread."""
     count = len(dataset) if limit is None else min(limit, len(dataset))
-    if not count:
-        raise DataError("no images to evaluate on")
+    if count < 1 or batch_size < 1:
+        raise DataError(f"no images to evaluate on (images {count}, batch size {batch_size})")
+
+    def prepare(index: int) -> tuple[LabelledImage, NDArray[np.uint8], Letterbox]:
+        sample = dataset[index]
+        image = sample.image if change is None else change(sample.image, sample.name)
+        return sample, *predictor.preprocess(image)
+
     samples: list[LabelledImage] = []
     canvases: list[NDArray[np.uint8]] = []
     letterboxes: list[Letterbox] = []
-    for sample in _ahead(dataset, range(count), 2 * batch_size + 2):
-        canvas, letterbox = predictor.preprocess(sample.image)
+    for sample, canvas, letterbox in _ahead(prepare, range(count), 2 * batch_size + 2):
         if samples and (len(samples) == batch_size or canvas.shape != canvases[0].shape):
             yield samples, letterboxes, predictor.backend.run(_stack(canvases))
             samples, canvases, letterboxes = [], [], []
@@ -195,13 +413,15 @@ def _stack(canvases: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
     return canvases[0][None] if len(canvases) == 1 else np.stack(canvases)
 
 
-def _ahead(dataset: LabelledImages, order: Iterable[int], depth: int) -> Iterator[LabelledImage]:
-    """Yield samples in order, reading up to ``depth`` ahead."""
+def _ahead(
+    prepare: Callable[[int], tuple[LabelledImage, NDArray[np.uint8], Letterbox]], order: Iterable[int], depth: int
+) -> Iterator[tuple[LabelledImage, NDArray[np.uint8], Letterbox]]:
+    """Yield what is prepared, in order, up to ``depth`` ahead."""
     with ThreadPoolExecutor(1, thread_name_prefix="reader") as pool:
-        waiting: collections.deque[Future[LabelledImage]] = collections.deque()
+        waiting: collections.deque[Future[tuple[LabelledImage, NDArray[np.uint8], Letterbox]]] = collections.deque()
         try:
             for index in order:
-                waiting.append(pool.submit(dataset.__getitem__, index))
+                waiting.append(pool.submit(prepare, index))
                 if len(waiting) > depth:
                     yield waiting.popleft().result()
             while waiting:
@@ -209,3 +429,26 @@ def _ahead(dataset: LabelledImages, order: Iterable[int], depth: int) -> Iterato
         finally:
             for future in waiting:
                 future.cancel()
+
+
+class _InOrder:
+    """Calls, one after the other in a thread of their own; a few may wait, and the first error is raised."""
+
+    def __init__(self, waiting: int = 8) -> None:
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="scorer")
+        self._futures: collections.deque[Future[None]] = collections.deque()
+        self._waiting = waiting
+
+    def __enter__(self) -> _InOrder:
+        return self
+
+    def submit(self, function: Callable[..., None], *arguments: Any) -> None:
+        self._futures.append(self._pool.submit(function, *arguments))
+        while len(self._futures) > self._waiting:
+            self._futures.popleft().result()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if error is None:
+            while self._futures:
+                self._futures.popleft().result()
+        self._pool.shutdown(wait=True, cancel_futures=True)

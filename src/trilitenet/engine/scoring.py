@@ -13,10 +13,25 @@ from trilitenet.config import Task
 from trilitenet.errors import ShapeError
 from trilitenet.metrics.detection import DetectionMetric, DetectionScores
 from trilitenet.metrics.lane import LaneMetric, LaneScores
+from trilitenet.metrics.published import (
+    PublishedDetection,
+    PublishedDetectionScores,
+    PublishedSegmentation,
+    PublishedSegmentationScores,
+)
 from trilitenet.metrics.segmentation import SegmentationMetric, SegmentationScores
-from trilitenet.structures import Perception
+from trilitenet.processing.letterbox import Letterbox
+from trilitenet.structures import Boxes, Perception
 
-__all__ = ["FairMetrics", "FairScores", "ImageOutcome", "LabelledImage"]
+__all__ = [
+    "CanvasPrediction",
+    "FairMetrics",
+    "FairScores",
+    "ImageOutcome",
+    "LabelledImage",
+    "PaperMetrics",
+    "PaperScores",
+]
 
 
 class LabelledImage(Protocol):
@@ -145,10 +160,140 @@ class FairMetrics:
         )
 
     def figures(self, weights: NDArray[Any] | None = None) -> dict[str, NDArray[np.float64]]:
-        """Return scores by name, ``task/figure``, under R weightings of the images at once."""
-        return {
-            f"{task}/{name}": value
-            for task, metric in (("detection", self.detection), ("drivable", self.drivable), ("lane", self.lane))
-            if metric is not None
-            for name, value in metric.figures(weights).items()
-        }
+        """Return scores by name, ``task/figure``, under R weightings of the images at once (see the metrics)."""
+        return _gather(self._by_task(), weights)
+
+    def _by_task(self) -> dict[Task, Any]:
+        metrics: dict[Task, Any] = {"detection": self.detection, "drivable": self.drivable, "lane": self.lane}
+        return {task: metric for task, metric in metrics.items() if metric is not None}
+
+    def state(self) -> dict[str, Any]:
+        """Return what was kept of each image, as ``json.dumps`` takes it."""
+        return {task: metric.state() for task, metric in self._by_task().items()}
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> FairMetrics:
+        """Read what `state` returned."""
+        metrics = cls((), ())
+        if "detection" in state:
+            metrics.detection = DetectionMetric.from_state(state["detection"])
+        if "drivable" in state:
+            metrics.drivable = SegmentationMetric.from_state(state["drivable"])
+        if "lane" in state:
+            metrics.lane = LaneMetric.from_state(state["lane"])
+        return metrics
+
+
+@dataclasses.dataclass(frozen=True)
+class PaperScores:
+    """Scores under the 'paper' protocol; None for a task that was not scored.
+
+    Attributes:
+        batch_size: Images a batch of the averages; batches follow the order of the images.
+        detection: Recall and average precision as published.
+        drivable: Figures as published, and over the data set.
+        lane: Likewise.
+    """
+
+    batch_size: int
+    detection: PublishedDetectionScores | None
+    drivable: PublishedSegmentationScores | None
+    lane: PublishedSegmentationScores | None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CanvasPrediction:
+    """What the 'paper' protocol compares: masks at the size that the image has inside the canvas.
+
+    Attributes:
+        boxes: In pixels of the source image, down to the published confidence; None without the task.
+        drivable: (h, w) bool, padding cropped; None without the task.
+        lane: Likewise.
+        letterbox: How the image was fitted into the canvas.
+    """
+
+    boxes: Boxes | None
+    drivable: NDArray[np.bool_] | None
+    lane: NDArray[np.bool_] | None
+    letterbox: Letterbox
+
+
+class PaperMetrics:
+    """The 'paper' protocol: the published evaluation, with its averages over batches.
+
+    Args:
+        classes: Number of detection classes.
+        tasks: Tasks to score.
+        batch_size: Images a batch of the averages.
+    """
+
+    name = "paper"
+
+    def __init__(self, classes: int, tasks: Sequence[Task], *, batch_size: int = 16) -> None:
+        self.batch_size = batch_size
+        self.detection = PublishedDetection(classes) if "detection" in tasks else None
+        self.drivable = PublishedSegmentation(batch_size) if "drivable" in tasks else None
+        self.lane = PublishedSegmentation(batch_size) if "lane" in tasks else None
+
+    def update(self, sample: LabelledImage, prediction: CanvasPrediction) -> None:
+        """Add an image; images come in the order that batches are made of."""
+        letterbox = prediction.letterbox
+        if self.detection is not None:
+            truth, truth_class = sample.boxes, sample.class_id
+            if truth is not None and truth_class is not None and self.detection.classes == 1:
+                # The published reader knows no ignored regions: they are objects to it.
+                truth = np.concatenate([truth, sample.ignored])
+                truth_class = np.zeros(len(truth), np.int64)
+            boxes = prediction.boxes
+            self.detection.update(
+                None if boxes is None else boxes.xyxy,
+                None if boxes is None else boxes.confidence,
+                None if boxes is None else boxes.class_id,
+                truth,
+                truth_class,
+            )
+        for metric, mask, true in (
+            (self.drivable, prediction.drivable, sample.drivable),
+            (self.lane, prediction.lane, sample.lane),
+        ):
+            if metric is not None:
+                metric.update(mask, None if true is None else letterbox.mask(true * np.uint8(255))[letterbox.inside])
+
+    def compute(self) -> PaperScores:
+        """Return the scores over all images."""
+        return PaperScores(
+            batch_size=self.batch_size,
+            detection=None if self.detection is None else self.detection.compute(),
+            drivable=None if self.drivable is None else self.drivable.compute(),
+            lane=None if self.lane is None else self.lane.compute(),
+        )
+
+    def figures(self, weights: NDArray[Any] | None = None) -> dict[str, NDArray[np.float64]]:
+        """Return scores by name, ``task/figure``, under R weightings of the images at once (see the metrics)."""
+        return _gather(self._by_task(), weights)
+
+    def _by_task(self) -> dict[Task, Any]:
+        metrics: dict[Task, Any] = {"detection": self.detection, "drivable": self.drivable, "lane": self.lane}
+        return {task: metric for task, metric in metrics.items() if metric is not None}
+
+    def state(self) -> dict[str, Any]:
+        """Return what was kept of each image, as ``json.dumps`` takes it."""
+        return {"batch_size": self.batch_size} | {task: metric.state() for task, metric in self._by_task().items()}
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> PaperMetrics:
+        """Read what `state` returned."""
+        metrics = cls(1, (), batch_size=state["batch_size"])
+        if "detection" in state:
+            metrics.detection = PublishedDetection.from_state(state["detection"])
+        if "drivable" in state:
+            metrics.drivable = PublishedSegmentation.from_state(state["drivable"])
+        if "lane" in state:
+            metrics.lane = PublishedSegmentation.from_state(state["lane"])
+        return metrics
+
+
+def _gather(metrics: dict[Task, Any], weights: NDArray[Any] | None) -> dict[str, NDArray[np.float64]]:
+    return {
+        f"{task}/{name}": value for task, metric in metrics.items() for name, value in metric.figures(weights).items()
+    }

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.errors import ShapeError
+from trilitenet.metrics.arithmetic import box_area, box_cover, box_overlap, mean_known, ratio
 from trilitenet.metrics.rows import Rows
-from trilitenet.metrics.segmentation import ratio
 
 __all__ = ["AREAS", "IOU_THRESHOLDS", "DetectionCurve", "DetectionMetric", "DetectionScores", "OperatingPoint"]
 
@@ -154,7 +154,8 @@ class DetectionMetric:
 
         The last row is background that was taken for an object, the last column objects that were missed.
         """
-        return self._confusion.copy()
+        confusion: NDArray[np.int64] = self._confusion.copy()
+        return confusion
 
     def update(
         self,
@@ -196,7 +197,7 @@ class DetectionMetric:
         for number in range(len(self.class_names)):
             picked = order[np.asarray(class_id)[order] == number][: self.max_boxes]
             true = np.asarray(truth, np.float64).reshape(-1, 4)[np.asarray(truth_class) == number]
-            objects[number] = self._in_range(_area(true)).sum(axis=1)
+            objects[number] = self._in_range(box_area(true)).sum(axis=1)
             if not len(picked):
                 continue
             matched, passed = self._match(np.asarray(boxes, np.float64)[picked], true, regions)
@@ -223,9 +224,9 @@ class DetectionMetric:
         bits = (1 << np.arange(len(limits))).astype(np.uint16)
         count, shape = len(boxes), (len(boxes), len(AREAS))
         matched, passed = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
-        outside = ~self._in_range(_area(boxes))  # (areas, D)
-        overlap = _iou(boxes, truth)
-        cover = _cover(boxes, regions)
+        outside = ~self._in_range(box_area(boxes))  # (areas, D)
+        overlap = box_overlap(boxes, truth)
+        cover = box_cover(boxes, regions)
         in_region = cover.max(axis=1)[:, None] >= limits if len(regions) else np.zeros((count, len(limits)), np.bool_)
         # Boxes near no true box: wrong, unless in an ignored region or outside the area range.
         passed[:] = np.where(
@@ -234,7 +235,7 @@ class DetectionMetric:
         if not len(truth):
             return matched, passed
         # The others, in falling order of confidence, for all area ranges and thresholds at once.
-        true_ignored = ~self._in_range(_area(truth))  # (areas, G)
+        true_ignored = ~self._in_range(box_area(truth))  # (areas, G)
         free = np.ones((len(AREAS), len(limits), len(truth)), np.bool_)
         best_cover = cover.max(axis=1) if len(regions) else np.full(count, -1.0)
         for row in np.flatnonzero(overlap.max(axis=1) >= limits[0]):
@@ -267,25 +268,26 @@ class DetectionMetric:
     ) -> tuple[int, int, int]:
         """Match sorted boxes to true ones of any class at IoU 0.5, into the confusion matrix."""
         background = len(self.class_names)
-        overlap = _iou(boxes, np.asarray(truth, np.float64).reshape(-1, 4))
-        covered = (_cover(boxes, regions) >= 0.5).any(axis=1)
-        free = np.ones(len(truth), np.bool_)
+        overlap = box_overlap(boxes, np.asarray(truth, np.float64).reshape(-1, 4))
+        covered: NDArray[np.bool_] = (box_cover(boxes, regions) >= 0.5).any(axis=1)
+        classes = np.asarray(truth_class, np.int64)
+        free: NDArray[np.bool_] = np.ones(len(truth), np.bool_)
         right = wrong = 0
         for row in range(len(boxes)):
             reach = np.where(free, overlap[row], -1.0)
             # A true box of the same class goes before one of another.
-            same = np.where(np.asarray(truth_class) == class_id[row], reach, -1.0)
+            same = np.where(classes == class_id[row], reach, -1.0)
             pick = same if len(same) and same.max() >= 0.5 else reach
             if len(pick) and pick.max() >= 0.5:
                 target = int(pick.argmax())
                 free[target] = False
-                true_class = int(truth_class[target])
+                true_class = int(classes[target])
                 self._confusion[true_class, int(class_id[row])] += 1
                 right, wrong = right + (true_class == class_id[row]), wrong + (true_class != class_id[row])
             elif not covered[row]:
                 self._confusion[background, int(class_id[row])] += 1
                 wrong += 1
-        np.add.at(self._confusion, (np.asarray(truth_class, np.int64)[free], background), 1)
+        self._confusion[:background, background] += np.bincount(classes[free], minlength=background)
         return int(right), int(wrong), len(truth) - int(right)
 
     # Scores -------------------------------------------------------------------------------------------------------
@@ -393,8 +395,8 @@ class DetectionMetric:
         """
         ap = self.average_precision(weights)
         return {
-            "ap50": _mean(ap[:, :, 0]),
-            "ap": _mean(ap.reshape(len(ap), -1)),
+            "ap50": mean_known(ap[:, :, 0]),
+            "ap": mean_known(ap.reshape(len(ap), -1)),
             **self._point_figures(weights),
         }
 
@@ -402,7 +404,7 @@ class DetectionMetric:
         """Return the scores over all images."""
         ap = self.average_precision()[0]
         sizes = {
-            name: float(_mean(self.average_precision(area=name)[0].reshape(1, -1))[0])
+            name: float(mean_known(self.average_precision(area=name)[0].reshape(1, -1))[0])
             for name in AREAS
             if name != "all"
         }
@@ -418,9 +420,9 @@ class DetectionMetric:
             not_labelled=int((~labelled).sum()),
             objects=int(objects.sum()),
             boxes=int(((self._ignored.array[:, 0] & np.uint16(1)) == 0).sum()),
-            ap50=float(_mean(ap[None, :, 0])[0]),
-            ap75=float(_mean(ap[None, :, 5])[0]),
-            ap=float(_mean(ap.reshape(1, -1))[0]),
+            ap50=float(mean_known(ap[None, :, 0])[0]),
+            ap75=float(mean_known(ap[None, :, 5])[0]),
+            ap=float(mean_known(ap.reshape(1, -1))[0]),
             ap_small=sizes["small"],
             ap_medium=sizes["medium"],
             ap_large=sizes["large"],
@@ -462,29 +464,6 @@ class DetectionMetric:
         return metric
 
 
-def _area(boxes: FloatArray) -> FloatArray:
-    sides = np.maximum(boxes[:, 2:] - boxes[:, :2], 0)
-    return np.asarray(sides[:, 0] * sides[:, 1], np.float64)
-
-
-def _intersection(boxes: FloatArray, others: FloatArray) -> FloatArray:
-    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
-    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
-    sides = np.maximum(high - low, 0)
-    return np.asarray(sides[..., 0] * sides[..., 1], np.float64)
-
-
-def _iou(boxes: FloatArray, others: FloatArray) -> FloatArray:
-    """Return (N, M) intersection over union, in float64 because thresholds are exact."""
-    shared = _intersection(boxes, others)
-    return np.nan_to_num(ratio(shared, _area(boxes)[:, None] + _area(others)[None] - shared))
-
-
-def _cover(boxes: FloatArray, regions: FloatArray) -> FloatArray:
-    """Return (N, M) intersection over the area of the box."""
-    return np.nan_to_num(ratio(_intersection(boxes, regions), _area(boxes)[:, None]))
-
-
 def _ap(hit: NDArray[np.bool_], weight: NDArray[Any] | None, objects: float) -> float:
     """Return the 101-point AP of boxes sorted by falling confidence."""
     if not len(hit):
@@ -506,12 +485,6 @@ def _ap(hit: NDArray[np.bool_], weight: NDArray[Any] | None, objects: float) -> 
         if len(envelope)
         else 0.0
     )
-
-
-def _mean(values: FloatArray) -> FloatArray:
-    """Return the mean over the last axis of what is not NaN; NaN where nothing is."""
-    known = ~np.isnan(values)
-    return ratio(np.where(known, values, 0).sum(axis=-1), known.sum(axis=-1))
 
 
 def _best_point(curve: DetectionCurve) -> OperatingPoint:

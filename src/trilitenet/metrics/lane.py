@@ -24,14 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.errors import ConfigError
+from trilitenet.metrics.arithmetic import ratio, weighted_sum
 from trilitenet.metrics.rows import Rows
 from trilitenet.metrics.segmentation import (
     SegmentationMetric,
     SegmentationScores,
     as_binary,
     confusion,
-    ratio,
-    weighted_sum,
 )
 
 __all__ = ["LaneMetric", "LaneScores", "boundary", "draw_at_width", "thin"]
@@ -118,7 +117,7 @@ def thin(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
                 flat[pixels[gone]] = 0
                 pixels = pixels[~gone]
                 changed = True
-    return padded[1:-1, 1:-1].copy()
+    return np.array(padded[1:-1, 1:-1], np.uint8)
 
 
 @functools.cache

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.errors import ShapeError
+from trilitenet.metrics.arithmetic import ratio, weighted_sum
 from trilitenet.metrics.rows import Rows
 
 __all__ = [
@@ -31,34 +32,9 @@ __all__ = [
     "as_binary",
     "confusion",
     "confusion_figures",
-    "ratio",
-    "weighted_sum",
 ]
 
 FloatArray = NDArray[np.float64]
-
-
-def ratio(numerator: Any, denominator: Any) -> FloatArray:
-    """Divide element by element; NaN where the denominator is 0."""
-    top, bottom = np.broadcast_arrays(np.asarray(numerator, np.float64), np.asarray(denominator, np.float64))
-    out = np.full(bottom.shape, np.nan)
-    np.divide(top, bottom, out=out, where=bottom > 0)
-    return out
-
-
-def weighted_sum(rows: NDArray[Any], weights: NDArray[Any] | None) -> FloatArray:
-    """Sum rows over images.
-
-    Args:
-        rows: (N, columns), one row an image.
-        weights: (R, N) how often each image counts, R weightings at once; None for once each (R = 1).
-
-    Returns:
-        (R, columns) float64.
-    """
-    if weights is None:
-        return rows.sum(axis=0, dtype=np.float64)[None]
-    return np.asarray(weights, np.float64) @ rows.astype(np.float64)
 
 
 def as_binary(mask: NDArray[Any], valid: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:

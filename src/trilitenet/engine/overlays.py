@@ -1,0 +1,93 @@
+"""Pictures of one task's errors on one image, small enough to keep the worst of a data set in memory."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.config import Task
+from trilitenet.engine.scoring import LabelledImage
+from trilitenet.metrics.arithmetic import box_cover, box_overlap
+from trilitenet.structures import Perception
+
+__all__ = ["FALSE", "IGNORED", "MISSED", "RIGHT", "error_overlay"]
+
+RIGHT: Final = (0, 158, 115)
+"""RGB of what prediction and truth share (colours of Okabe and Ito, told apart with colour-blind eyes)."""
+FALSE: Final = (213, 94, 0)
+"""RGB of what only the prediction has."""
+MISSED: Final = (86, 180, 233)
+"""RGB of what only the truth has."""
+IGNORED: Final = (150, 150, 150)
+"""RGB of ignored regions."""
+
+
+def error_overlay(
+    sample: LabelledImage, prediction: Perception, task: Task, *, confidence: float, width: int = 480, quality: int = 80
+) -> bytes:
+    """Draw right, false and missed in three colours.
+
+    Args:
+        sample: The image and its labels.
+        prediction: In pixels of the image.
+        task: The task to show.
+        confidence: Boxes above this are drawn.
+        width: Pixels across the picture; a smaller image is not enlarged.
+        quality: Of the JPEG, 1 to 100.
+
+    Returns:
+        The bytes of a JPEG file.
+    """
+    height, full = sample.image.shape[:2]
+    scale = min(1.0, width / full)
+    size = (max(1, round(full * scale)), max(1, round(height * scale)))
+    picture = cv2.resize(sample.image, size, interpolation=cv2.INTER_AREA)
+    if task == "detection":
+        _draw_boxes(picture, sample, prediction, confidence, scale)
+    else:
+        predicted, true = getattr(prediction, task), getattr(sample, task)
+        if predicted is not None and true is not None:
+            _draw_masks(picture, predicted, true, thick=task == "lane")
+    encoded = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return bytes(np.asarray(encoded, np.uint8))
+
+
+def _draw_masks(picture: NDArray[np.uint8], predicted: NDArray[Any], true: NDArray[Any], thick: bool) -> None:
+    size = picture.shape[1::-1]
+    small = [cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA) for mask in (predicted, true)]
+    # Thin lines survive the shrinking when any share of a pixel counts.
+    first, second = (mask > (40 if thick else 127) for mask in small)
+    for where, colour in ((first & second, RIGHT), (first & ~second, FALSE), (second & ~first, MISSED)):
+        opacity = 0.85 if thick else 0.5
+        picture[where] = (picture[where] * (1 - opacity) + np.array(colour) * opacity).astype(np.uint8)
+
+
+def _draw_boxes(
+    picture: NDArray[np.uint8], sample: LabelledImage, prediction: Perception, confidence: float, scale: float
+) -> None:
+    truth = np.zeros((0, 4)) if sample.boxes is None else np.asarray(sample.boxes, np.float64)
+    regions = np.asarray(sample.ignored, np.float64)
+    boxes = np.zeros((0, 4))
+    if prediction.boxes is not None:
+        boxes = np.asarray(prediction.boxes.xyxy[prediction.boxes.confidence > confidence], np.float64)
+    overlap = box_overlap(boxes, truth)
+    found = np.zeros(len(truth), np.bool_)
+    for region in regions:
+        _rectangle(picture, region, scale, IGNORED)
+    for row, box in enumerate(boxes):
+        reach = np.where(found, -1.0, overlap[row])
+        if len(reach) and reach.max() >= 0.5:
+            found[reach.argmax()] = True
+            _rectangle(picture, box, scale, RIGHT)
+        elif not (box_cover(box[None], regions) >= 0.5).any():
+            _rectangle(picture, box, scale, FALSE)
+    for box in truth[~found]:
+        _rectangle(picture, box, scale, MISSED)
+
+
+def _rectangle(picture: NDArray[np.uint8], box: NDArray[Any], scale: float, colour: tuple[int, int, int]) -> None:
+    left, top, right, bottom = (round(float(value) * scale) for value in box)
+    cv2.rectangle(picture, (left, top), (right, bottom), colour, 2, cv2.LINE_AA)

@@ -1,0 +1,421 @@
+"""The report card: what was measured, on what, with what, and how sure the figures are."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import io
+import json
+import math
+import shutil
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from trilitenet.engine.figures import CONDITION_FIGURES, meaning
+from trilitenet.engine.scoring import FairMetrics, FairScores, PaperMetrics, PaperScores
+from trilitenet.errors import DataError, OutputError
+
+__all__ = [
+    "FEW_IMAGES",
+    "REPORT_SCHEMA",
+    "Condition",
+    "DetectionPlots",
+    "Figure",
+    "Provenance",
+    "Report",
+    "WorstFrame",
+    "percent",
+    "read_report",
+]
+
+REPORT_SCHEMA: Final = 1
+"""Version of the JSON; a file with a higher one is refused. docs/evaluation.md describes it."""
+FEW_IMAGES: Final = 30
+"""A table cell from fewer images says little and is greyed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """A value and its 95% bootstrap interval by image.
+
+    Attributes:
+        value: In [0, 1]; NaN where undefined.
+        low: Lower end; None without resampling.
+        high: Upper end; None without resampling.
+    """
+
+    value: float
+    low: float | None = None
+    high: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Condition:
+    """Figures over the images of one condition.
+
+    Attributes:
+        attribute: For example ``"timeofday"``.
+        value: For example ``"night"``.
+        images: How many images have it.
+        figures: Figure key -> value.
+    """
+
+    attribute: str
+    value: str
+    images: int
+    figures: dict[str, float]
+
+    @property
+    def few(self) -> bool:
+        """Whether there are too few images to say much."""
+        return self.images < FEW_IMAGES
+
+
+@dataclasses.dataclass(frozen=True)
+class WorstFrame:
+    """One of the images that a task went worst on.
+
+    Attributes:
+        task: The task.
+        name: The image.
+        score: Detection: F1; drivable: IoU; lane: F1 with 2 px tolerance.
+        note: Counts, in words.
+        picture: JPEG with right, false and missed in colours; empty if it was not kept.
+    """
+
+    task: str
+    name: str
+    score: float
+    note: str
+    picture: bytes = dataclasses.field(default=b"", repr=False)
+
+
+@dataclasses.dataclass(frozen=True)
+class DetectionPlots:
+    """What the plots of detection are drawn from, IoU 0.5.
+
+    Attributes:
+        recall: Along falling confidence, at most a few hundred points.
+        precision: Likewise.
+        confidence: Likewise.
+        right: Right boxes by twentieths of confidence.
+        wrong: Wrong boxes by twentieths of confidence.
+        confusion: Row truth, column prediction, at the stated confidence; the last of each is background.
+        class_names: Of rows and columns.
+    """
+
+    recall: tuple[float, ...]
+    precision: tuple[float, ...]
+    confidence: tuple[float, ...]
+    right: tuple[int, ...]
+    wrong: tuple[int, ...]
+    confusion: tuple[tuple[int, ...], ...]
+    class_names: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Provenance:
+    """All that is needed to get the same figures again.
+
+    Attributes:
+        model: File, name or folder of predictions.
+        model_sha256: Of the file; None where there is none.
+        runtime: Runtime and device.
+        data: Where the images are.
+        split: Their split.
+        images: How many.
+        data_sha256: Of images, masks and boxes, apart.
+        thresholds: Decision thresholds.
+        settings: Further settings of the protocols.
+        canvas: Sizes of the network's input, "width x height".
+        versions: Versions by package.
+        hardware: Processor, cores, system.
+        started: ISO 8601, UTC.
+        seconds: From the first image to the last figure.
+        peak_memory_mib: Most memory held by the process.
+    """
+
+    model: str
+    model_sha256: str | None
+    runtime: str
+    data: str
+    split: str
+    images: int
+    data_sha256: dict[str, str]
+    thresholds: dict[str, float]
+    settings: dict[str, Any]
+    canvas: tuple[str, ...]
+    versions: dict[str, str]
+    hardware: str
+    started: str
+    seconds: float
+    peak_memory_mib: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Report:
+    """A report card.
+
+    Attributes:
+        provenance: Model, data, settings, machine.
+        fair: Scores under the 'fair' protocol; None if it was not asked for.
+        paper: Scores under the 'paper' protocol; None if it was not asked for.
+        figures: ``protocol/task/name`` -> value and interval.
+        conditions: Figures by weather, scene, time of day.
+        plots: Of detection; None without it.
+        worst: The images that went worst, a task after the other.
+        names: The images, in order.
+        state: Counts an image, from which every figure can be computed again.
+    """
+
+    provenance: Provenance
+    fair: FairScores | None
+    paper: PaperScores | None
+    figures: dict[str, Figure]
+    conditions: tuple[Condition, ...]
+    plots: DetectionPlots | None
+    worst: tuple[WorstFrame, ...]
+    names: tuple[str, ...]
+    state: dict[str, Any] = dataclasses.field(repr=False)
+
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """The protocols that were used."""
+        return tuple(name for name, scores in (("fair", self.fair), ("paper", self.paper)) if scores is not None)
+
+    def metrics(self) -> dict[str, FairMetrics | PaperMetrics]:
+        """Return the metrics by protocol, filled, to compute further figures from."""
+        readers: dict[str, Any] = {"fair": FairMetrics.from_state, "paper": PaperMetrics.from_state}
+        return {name: readers[name](state) for name, state in self.state.items()}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``json.dumps`` takes: the documented JSON form (without pictures; NaN is null)."""
+        mapping = {
+            "schema": REPORT_SCHEMA,
+            "provenance": dataclasses.asdict(self.provenance),
+            "figures": {key: dataclasses.asdict(figure) for key, figure in self.figures.items()},
+            "meanings": {key: dataclasses.asdict(meaning(key)) for key in self.figures},
+            "fair": None if self.fair is None else dataclasses.asdict(self.fair),
+            "paper": None if self.paper is None else dataclasses.asdict(self.paper),
+            "conditions": [dataclasses.asdict(row) | {"few": row.few} for row in self.conditions],
+            "detection_plots": None if self.plots is None else dataclasses.asdict(self.plots),
+            "worst": [
+                {"task": frame.task, "name": frame.name, "score": frame.score, "note": frame.note}
+                for frame in self.worst
+            ],
+            "images": list(self.names),
+            "state": self.state,
+        }
+        return dict(_without_nan(mapping))
+
+    def save_json(self, path: Path) -> None:
+        """Write the JSON form.
+
+        Raises:
+            OutputError: If it cannot be written.
+        """
+        _write(path, json.dumps(self.to_dict(), ensure_ascii=False, separators=(",", ":")) + "\n")
+
+    def save_html(self, path: Path) -> None:
+        """Write one self-contained HTML page.
+
+        Raises:
+            OutputError: If it cannot be written.
+        """
+        from trilitenet.engine.report_html import report_page
+
+        _write(path, report_page(self))
+
+    def summary(self) -> str:
+        """Return the report as text for a terminal: every figure with its interval and formula, then conditions."""
+        tables: list[Table | Text] = [_provenance_text(self.provenance)]
+        for protocol in self.protocols:
+            tables.append(_figure_table(protocol, self.figures))
+        tables.append(_exclusions(self))
+        tables += [_condition_table(protocol, self.conditions) for protocol in self.protocols if self.conditions]
+        return render(tables)
+
+
+def render(parts: list[Any]) -> str:
+    """Render rich objects as text, coloured if standard output is a terminal."""
+    buffer = io.StringIO()
+    terminal = sys.stdout.isatty()
+    width = max(shutil.get_terminal_size((110, 40)).columns, 80)
+    console = Console(file=buffer, force_terminal=terminal, width=width, highlight=False)
+    for part in parts:
+        console.print(part)
+    return buffer.getvalue().rstrip()
+
+
+def percent(value: float | None, digits: int = 1) -> str:
+    """Return a ratio as per cent, a dash where it is undefined."""
+    return "–" if value is None or math.isnan(value) else f"{100 * value:.{digits}f}"
+
+
+def _figure_table(protocol: str, figures: Mapping[str, Figure]) -> Table:
+    table = Table(
+        title=f"{protocol} protocol (per cent)", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold"
+    )
+    table.add_column("task")
+    table.add_column("figure", no_wrap=True)
+    table.add_column("value", justify="right")
+    table.add_column("95% interval", justify="right", no_wrap=True)
+    table.add_column("formula", style="dim")
+    last = ""
+    for key, figure in figures.items():
+        owner, task, _ = key.split("/")
+        if owner != protocol:
+            continue
+        interval = "" if figure.low is None else f"{percent(figure.low)} to {percent(figure.high)}"
+        words = meaning(key)
+        table.add_row(task if task != last else "", words.title, percent(figure.value), interval, words.formula)
+        last = task
+    return table
+
+
+def _condition_table(protocol: str, conditions: tuple[Condition, ...]) -> Table:
+    keys = [key for key in CONDITION_FIGURES[protocol] if any(key in row.figures for row in conditions)]
+    table = Table(
+        title=f"by condition, {protocol} (per cent; in brackets: under {FEW_IMAGES} images)",
+        box=box.SIMPLE_HEAD,
+        title_justify="left",
+        title_style="bold",
+    )
+    table.add_column("condition")
+    table.add_column("value")
+    table.add_column("images", justify="right")
+    for key in keys:
+        table.add_column(f"{key.split('/')[1]} {meaning(key).title}", justify="right")
+    last = ""
+    for row in conditions:
+        cells = [percent(row.figures.get(key)) for key in keys]
+        if row.few:
+            cells = [f"({cell})" for cell in cells]
+        table.add_row(
+            row.attribute if row.attribute != last else "",
+            row.value,
+            str(row.images),
+            *cells,
+            style="dim" if row.few else None,
+        )
+        last = row.attribute
+    return table
+
+
+def _provenance_text(provenance: Provenance) -> Text:
+    lines = [
+        f"model  {provenance.model} ({provenance.runtime}, canvas {', '.join(provenance.canvas)})",
+        f"data   {provenance.data} {provenance.split}, {provenance.images} images",
+        f"with   {', '.join(f'{name} {value:g}' for name, value in provenance.thresholds.items())}",
+        f"on     {provenance.hardware}; {provenance.seconds:.1f} s, peak memory {provenance.peak_memory_mib:.0f} MiB",
+    ]
+    return Text("\n".join(lines))
+
+
+def _exclusions(report: Report) -> Text:
+    """Say which images did not count, a task."""
+    if report.fair is None:
+        return Text("")
+    lane = None if report.fair.lane is None else report.fair.lane.as_labelled
+    parts = [
+        f"{task}: {scores.images} images count, {scores.both_empty} empty in both, {scores.not_labelled} not labelled"
+        for task, scores in (("detection", report.fair.detection), ("drivable", report.fair.drivable), ("lane", lane))
+        if scores is not None
+    ]
+    return Text("\n".join(parts))
+
+
+def read_report(path: Path) -> Report:
+    """Read what `Report.save_json` wrote (without scores as dataclasses and without pictures).
+
+    Raises:
+        DataError: If it is no report, or a newer one.
+    """
+    try:
+        mapping = json.loads(path.read_bytes())
+        schema = mapping["schema"]
+        if not isinstance(schema, int) or schema > REPORT_SCHEMA:
+            raise DataError(f"{path}: report schema {schema!r} is newer than {REPORT_SCHEMA}; upgrade trilitenet")
+        state = mapping["state"]
+        provenance = Provenance(**{**mapping["provenance"], "canvas": tuple(mapping["provenance"]["canvas"])})
+        readers: dict[str, Any] = {"fair": FairMetrics.from_state, "paper": PaperMetrics.from_state}
+        metrics = {name: readers[name](part) for name, part in state.items()}
+        plots = mapping["detection_plots"]
+        return Report(
+            provenance=provenance,
+            fair=metrics["fair"].compute() if "fair" in metrics else None,
+            paper=metrics["paper"].compute() if "paper" in metrics else None,
+            figures={
+                key: Figure(_number(figure["value"]), figure["low"], figure["high"])
+                for key, figure in mapping["figures"].items()
+            },
+            conditions=tuple(
+                Condition(
+                    row["attribute"],
+                    row["value"],
+                    row["images"],
+                    {key: _number(value) for key, value in row["figures"].items()},
+                )
+                for row in mapping["conditions"]
+            ),
+            plots=None if plots is None else _plots(plots),
+            worst=tuple(
+                WorstFrame(frame["task"], frame["name"], _number(frame["score"]), frame["note"])
+                for frame in mapping["worst"]
+            ),
+            names=tuple(mapping["images"]),
+            state=state,
+        )
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(f"{path}: not a report that `trilitenet evaluate` wrote ({error!r})") from error
+
+
+def _plots(mapping: Mapping[str, Any]) -> DetectionPlots:
+    return DetectionPlots(
+        **{name: tuple(_number(value) for value in mapping[name]) for name in ("recall", "precision", "confidence")},
+        right=tuple(mapping["right"]),
+        wrong=tuple(mapping["wrong"]),
+        confusion=tuple(tuple(row) for row in mapping["confusion"]),
+        class_names=tuple(mapping["class_names"]),
+    )
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else float(value)
+
+
+def _without_nan(value: Any) -> Any:
+    """Replace NaN by None, since JSON has none, and keys by strings."""
+    if isinstance(value, float):
+        return None if math.isnan(value) else value
+    if isinstance(value, Mapping):
+        return {str(key): _without_nan(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        if value and all(isinstance(item, int) for item in value):
+            return list(value)
+        return [_without_nan(item) for item in value]
+    return value
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def as_data_uri(picture: bytes) -> str:
+    """Return a JPEG as a data URI."""
+    return f"data:image/jpeg;base64,{base64.b64encode(picture).decode()}"

@@ -1,0 +1,202 @@
+"""Collect predictions image by image, whoever made them, and turn them into a report."""
+
+from __future__ import annotations
+
+import collections
+import heapq
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Final, Literal
+
+import numpy as np
+
+from trilitenet.config import TASKS, Task, Thresholds
+from trilitenet.engine.overlays import error_overlay
+from trilitenet.engine.report import Condition, DetectionPlots, Figure, Provenance, Report, WorstFrame
+from trilitenet.engine.scoring import CanvasPrediction, FairMetrics, ImageOutcome, LabelledImage, PaperMetrics
+from trilitenet.errors import ConfigError, DataError
+from trilitenet.metrics.bootstrap import bootstrap, interval
+from trilitenet.metrics.detection import DetectionMetric
+from trilitenet.structures import Perception
+
+__all__ = ["CONDITIONS", "PAPER_THRESHOLDS", "PROTOCOLS", "Protocol", "Scorecard", "protocols_of"]
+
+Protocol = Literal["paper", "fair", "both"]
+PROTOCOLS: Final = ("paper", "fair", "both")
+CONDITIONS: Final = ("timeofday", "weather", "scene")
+"""Attributes that tables are made by, in the paper's order."""
+PAPER_THRESHOLDS: Final = Thresholds(confidence=0.001, iou=0.6, max_boxes=300, drivable=0.5, lane=0.5)
+"""What the published evaluation decides with."""
+_CURVE_POINTS: Final = 400
+
+
+def protocols_of(protocol: str) -> tuple[str, ...]:
+    """Return the protocols that a choice stands for.
+
+    Raises:
+        ConfigError: If there is no such choice.
+    """
+    if protocol not in PROTOCOLS:
+        raise ConfigError(f"unknown protocol {protocol!r}; known: {', '.join(PROTOCOLS)}")
+    return ("fair", "paper") if protocol == "both" else (protocol,)
+
+
+class Scorecard:
+    """Scores of predictions, an image at a time, in memory that does not grow with the size of the images.
+
+    Args:
+        class_names: Detection classes.
+        tasks: Tasks to score.
+        protocol: ``"fair"``, ``"paper"`` or ``"both"``.
+        confidence: The stated confidence of precision, recall and F1, and of boxes in pictures.
+        paper_batch: Images a batch of the published averages.
+        worst: How many of the worst images to keep pictures of, a task; 0 for none.
+        by: Attributes to make tables by.
+
+    Raises:
+        ConfigError: If there is no such protocol.
+    """
+
+    def __init__(
+        self,
+        class_names: Sequence[str],
+        tasks: Sequence[Task],
+        *,
+        protocol: str = "fair",
+        confidence: float = 0.25,
+        paper_batch: int = 16,
+        worst: int = 24,
+        by: Sequence[str] = CONDITIONS,
+    ) -> None:
+        chosen = protocols_of(protocol)
+        self.tasks = tuple(task for task in TASKS if task in tasks)
+        self.fair = FairMetrics(class_names, self.tasks, confidence=confidence) if "fair" in chosen else None
+        self.paper = PaperMetrics(len(class_names), self.tasks, batch_size=paper_batch) if "paper" in chosen else None
+        self._confidence = confidence
+        self._keep = worst
+        self._by = tuple(by)
+        self._names: list[str] = []
+        self._values: dict[str, list[str]] = {attribute: [] for attribute in by}
+        self._worst: dict[Task, list[tuple[float, int, int, WorstFrame]]] = {task: [] for task in self.tasks}
+        self._serial = itertools.count()
+
+    def add(self, sample: LabelledImage, prediction: Perception | None, canvas: CanvasPrediction | None) -> None:
+        """Add an image.
+
+        Args:
+            sample: The image and its labels.
+            prediction: For the 'fair' protocol: in pixels of the image, boxes down to the lowest confidence.
+            canvas: For the 'paper' protocol.
+        """
+        self._names.append(sample.name)
+        for attribute in self._by:
+            self._values[attribute].append(sample.attributes.get(attribute, "") or "undefined")
+        if self.fair is not None and prediction is not None:
+            outcome = self.fair.update(sample, prediction)
+            if self._keep:
+                self._remember(sample, prediction, outcome)
+        if self.paper is not None and canvas is not None:
+            self.paper.update(sample, canvas)
+
+    def _remember(self, sample: LabelledImage, prediction: Perception, outcome: ImageOutcome) -> None:
+        """Keep a picture of the image if a task went worse on it than on those kept."""
+        errors = outcome.wrong + outcome.missed
+        notes = {
+            "detection": f"F1 {outcome.detection or 0:.2f}: {outcome.right} right, {outcome.wrong} false, "
+            f"{outcome.missed} missed",
+            "drivable": f"IoU {outcome.drivable or 0:.2f}",
+            "lane": f"F1 with 2 px tolerance {outcome.lane or 0:.2f}",
+        }
+        for task in self.tasks:
+            score: float | None = getattr(outcome, task)
+            if score is None or np.isnan(score):
+                continue
+            heap = self._worst[task]
+            badness = (1.0 - score, errors if task == "detection" else 0)
+            if len(heap) >= self._keep and badness <= heap[0][:2]:
+                continue
+            picture = error_overlay(sample, prediction, task, confidence=self._confidence)
+            entry = (*badness, -next(self._serial), WorstFrame(task, sample.name, score, notes[task], picture))
+            if len(heap) < self._keep:
+                heapq.heappush(heap, entry)
+            else:
+                heapq.heapreplace(heap, entry)
+
+    def report(self, provenance: Callable[[int], Provenance], *, resamples: int = 1000, seed: int = 0) -> Report:
+        """Compute every figure.
+
+        Args:
+            provenance: Given the number of images, says where the figures come from; called last.
+            resamples: Bootstrap draws for the intervals; 0 for no intervals.
+            seed: Of the draws.
+
+        Raises:
+            DataError: If no image was added.
+        """
+        count = len(self._names)
+        if not count:
+            raise DataError("no images to score")
+        metrics = {"fair": self.fair, "paper": self.paper}
+        figures: dict[str, Figure] = {}
+        rows = self._condition_rows()
+        members = np.array([where for _, _, where in rows], np.int32).reshape(len(rows), count)
+        tables: list[dict[str, float]] = [{} for _ in rows]
+        for protocol, metric in metrics.items():
+            if metric is None:
+                continue
+            spread = bootstrap(metric.figures, count, resamples, seed)
+            for name, value in metric.figures().items():
+                low, high = interval(spread[name]) if resamples else (None, None)
+                figures[f"{protocol}/{name}"] = Figure(float(value[0]), low, high)
+            if rows:
+                for name, values in metric.figures(members).items():
+                    for table, value in zip(tables, values, strict=True):
+                        table[f"{protocol}/{name}"] = float(value)
+        fair, paper = self.fair, self.paper
+        return Report(
+            fair=None if fair is None else fair.compute(),
+            paper=None if paper is None else paper.compute(),
+            figures=figures,
+            conditions=tuple(
+                Condition(attribute, value, int(sum(where)), table)
+                for (attribute, value, where), table in zip(rows, tables, strict=True)
+            ),
+            plots=None if fair is None or fair.detection is None else _detection_plots(fair.detection),
+            worst=tuple(
+                entry[3]
+                for task in self.tasks
+                for entry in sorted(self._worst[task], key=lambda entry: entry[:3])[::-1]
+            ),
+            names=tuple(self._names),
+            state={name: metric.state() for name, metric in metrics.items() if metric is not None},
+            provenance=provenance(count),
+        )
+
+    def _condition_rows(self) -> list[tuple[str, str, list[int]]]:
+        """Return attribute, value and membership of every image, for attributes that some image has."""
+        rows: list[tuple[str, str, list[int]]] = []
+        for attribute, values in self._values.items():
+            counts = collections.Counter(values)
+            if set(counts) == {"undefined"}:
+                continue
+            rows += [
+                (attribute, value, [int(one == value) for one in values])
+                for value, _ in sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+            ]
+        return rows
+
+
+def _detection_plots(metric: DetectionMetric) -> DetectionPlots:
+    curve = metric.curve()
+    count = len(curve.confidence)
+    picked = np.unique(np.linspace(0, count - 1, min(count, _CURVE_POINTS)).astype(np.int64)) if count else []
+    right, wrong = metric.histogram(20)
+    return DetectionPlots(
+        recall=tuple(float(value) for value in curve.recall[picked]),
+        precision=tuple(float(value) for value in curve.precision[picked]),
+        confidence=tuple(float(value) for value in curve.confidence[picked]),
+        right=tuple(int(value) for value in right),
+        wrong=tuple(int(value) for value in wrong),
+        confusion=tuple(tuple(int(value) for value in row) for row in metric.confusion),
+        class_names=(*metric.class_names, "background"),
+    )

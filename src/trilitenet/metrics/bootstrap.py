@@ -1,0 +1,56 @@
+"""Bootstrap by image: how far a figure would move had other images of the same kind been drawn.
+
+Images are drawn with replacement as many times as there are (Efron, 1979); each draw gives every figure anew, and the
+95% interval is the range of the middle 95% of them (percentile method). To compare two models the same draws are used
+for both, so that hard images are hard for both: a difference is real when its interval leaves out 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["bootstrap", "draws", "interval"]
+
+FloatArray = NDArray[np.float64]
+_CHUNK = 100
+
+
+def draws(images: int, resamples: int, seed: int = 0) -> Iterator[NDArray[np.int32]]:
+    """Yield (up to 100, images) arrays of how often each image is drawn, ``resamples`` rows in all."""
+    rng = np.random.default_rng(seed)
+    for start in range(0, resamples, _CHUNK):
+        rows = min(_CHUNK, resamples - start)
+        weights = np.zeros((rows, images), np.int32)
+        for row in weights:
+            row += np.bincount(rng.integers(0, images, images), minlength=images).astype(np.int32)
+        yield weights
+
+
+def bootstrap(
+    figures: Callable[[NDArray[np.int32]], Mapping[str, FloatArray]], images: int, resamples: int, seed: int = 0
+) -> dict[str, FloatArray]:
+    """Compute figures on resampled images.
+
+    Args:
+        figures: (R, images) weights -> name -> (R,) values.
+        images: How many images there are.
+        resamples: How often to resample.
+        seed: The same seed gives the same draws, so that models can be compared pairwise.
+
+    Returns:
+        Name -> (resamples,) values.
+    """
+    parts = [figures(weights) for weights in draws(images, resamples, seed)]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
+
+
+def interval(values: FloatArray, level: float = 0.95) -> tuple[float, float]:
+    """Return the range of the middle ``level`` of the values, NaN left out; NaN if nothing is left."""
+    known = values[~np.isnan(values)]
+    if not len(known):
+        return float("nan"), float("nan")
+    low, high = np.quantile(known, [(1 - level) / 2, (1 + level) / 2])
+    return float(low), float(high)

@@ -1,0 +1,376 @@
+"""The published evaluation ('paper' protocol), kept so that its figures can be reproduced and compared with.
+
+Its conventions, which differ from those of the 'fair' protocol:
+
+- Masks are compared at the size the image has inside the canvas (640x360 for 1280x720). Figures are computed a batch
+  and averaged over batches, each weighing as many images as it holds; 0/0 counts as 0. So they hang on the batch size
+  and on the order of the images; the value over the whole data set stands beside each.
+
+      mIoU = (IoU of background + IoU of foreground) / 2      IoU = TP / (TP + FP + FN)
+      Acc  = (TP / (TP + FN) + TN / (TN + FP)) / 2            ('balanced accuracy'; other papers call recall 'Acc')
+
+- A box tries only the true box it overlaps most, and is right when the IoU is strictly above the threshold and no
+  better box took that one. Ignored regions are unknown to it: in its files they are objects like any other.
+
+      Recall = recall of all boxes down to confidence 0.001, at IoU 0.5
+      AP     = area under the precision envelope at recall 0, 0.01, ..., 1 by the trapezoid rule, where the curve
+               starts at precision 1 and falls, linearly, to precision 0 at the last recall + 0.001
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.errors import ConfigError, ShapeError
+from trilitenet.metrics.arithmetic import box_overlap, mean_known, ratio, weighted_sum
+from trilitenet.metrics.detection import IOU_THRESHOLDS
+from trilitenet.metrics.rows import Rows
+from trilitenet.metrics.segmentation import as_binary, confusion
+
+__all__ = [
+    "PublishedDetection",
+    "PublishedDetectionScores",
+    "PublishedSegmentation",
+    "PublishedSegmentationScores",
+    "published_average_precision",
+]
+
+FloatArray = NDArray[np.float64]
+
+
+def _zero_ratio(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
+    """Divide; 0 where the denominator is 0, as published."""
+    return np.nan_to_num(ratio(numerator, denominator))
+
+
+def _batch_figures(counts: FloatArray) -> dict[str, FloatArray]:
+    """Return the published figures of (..., 4) TP, FP, FN, TN."""
+    tp, fp, fn, tn = np.moveaxis(counts, -1, 0)
+    iou = _zero_ratio(tp, tp + fp + fn)
+    sensitivity = _zero_ratio(tp, tp + fn)
+    return {
+        "miou": (iou + _zero_ratio(tn, tn + fp + fn)) / 2,
+        "acc": (sensitivity + _zero_ratio(tn, tn + fp)) / 2,
+        "iou": iou,
+        "recall": sensitivity,
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class PublishedSegmentationScores:
+    """Published scores of one mask, in [0, 1]; NaN without a labelled image.
+
+    Attributes:
+        images: Labelled images.
+        not_labelled: Images without truth, left out.
+        miou: Mean of foreground and background IoU, averaged over batches.
+        acc: Balanced accuracy, averaged over batches.
+        iou: Foreground IoU, averaged over batches.
+        recall: Sensitivity, averaged over batches.
+        dataset_miou: The same from one confusion matrix over the data set.
+        dataset_acc: Likewise.
+        dataset_iou: Likewise.
+        dataset_recall: Likewise.
+    """
+
+    images: int
+    not_labelled: int
+    miou: float
+    acc: float
+    iou: float
+    recall: float
+    dataset_miou: float
+    dataset_acc: float
+    dataset_iou: float
+    dataset_recall: float
+
+
+class PublishedSegmentation:
+    """The published figures of one mask, an image at a time, in the order that batches are made of.
+
+    Args:
+        batch_size: Images a batch.
+
+    Raises:
+        ConfigError: If it is below 1.
+    """
+
+    def __init__(self, batch_size: int = 16) -> None:
+        if batch_size < 1:
+            raise ConfigError(f"batch_size must be at least 1, got {batch_size}")
+        self.batch_size = batch_size
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._counts = Rows(4)
+        self._labelled = Rows(1, np.bool_)
+
+    def __len__(self) -> int:
+        return len(self._counts)
+
+    def update(self, prediction: NDArray[Any] | None, truth: NDArray[Any] | None) -> None:
+        """Add an image.
+
+        Args:
+            prediction: (h, w) bool, or uint8 with foreground above 0, at the size inside the canvas; None if the
+                model gave none.
+            truth: Likewise, resized by area with everything above 1 of 255 foreground; None = not labelled.
+
+        Raises:
+            ShapeError: If the masks are of different sizes.
+        """
+        counted = prediction is not None and truth is not None
+        if prediction is not None and truth is not None:
+            self._counts.append(confusion(as_binary(prediction), as_binary(truth)))
+        else:
+            self._counts.append((0, 0, 0, 0))
+        self._labelled.append(counted)
+
+    def figures(self, weights: NDArray[Any] | None = None) -> dict[str, FloatArray]:
+        """Return figures by name under R weightings of the images at once.
+
+        Args:
+            weights: (R, N) how often each image counts, whole numbers; batches are made of the images so repeated, in
+                order. None for once each.
+
+        Returns:
+            Name -> (R,).
+        """
+        counts = self._counts.array.astype(np.float64)
+        labelled = self._labelled.array[:, 0]
+        repeats = np.ones((1, len(counts)), np.int64) if weights is None else np.asarray(weights).astype(np.int64)
+        rows = [self._averages(counts, labelled, repeat) for repeat in repeats]
+        figures = {name: np.array([row[name] for row in rows]) for name in ("miou", "acc", "iou", "recall")}
+        whole = weighted_sum(self._counts.array, weights)
+        empty = whole.sum(axis=1) == 0
+        for name, value in _batch_figures(whole).items():
+            figures[f"dataset_{name}"] = np.where(empty, np.nan, value)
+        return figures
+
+    def _averages(self, counts: FloatArray, labelled: NDArray[np.bool_], repeat: NDArray[np.int64]) -> dict[str, float]:
+        order = np.repeat(np.arange(len(counts)), repeat)
+        starts = np.arange(0, len(order), self.batch_size)
+        images = np.add.reduceat(labelled[order].astype(np.float64), starts) if len(order) else np.zeros(0)
+        if not images.sum():
+            return dict.fromkeys(("miou", "acc", "iou", "recall"), float("nan"))
+        batches = _batch_figures(np.add.reduceat(counts[order], starts, axis=0))
+        return {name: float((value * images).sum() / images.sum()) for name, value in batches.items()}
+
+    def compute(self) -> PublishedSegmentationScores:
+        """Return the scores over all images."""
+        labelled = self._labelled.array[:, 0]
+        return PublishedSegmentationScores(
+            images=int(labelled.sum()),
+            not_labelled=int((~labelled).sum()),
+            **{name: float(value[0]) for name, value in self.figures().items()},
+        )
+
+    def state(self) -> dict[str, Any]:
+        """Return the counts an image, as ``json.dumps`` takes them."""
+        return {
+            "batch_size": self.batch_size,
+            "counts": self._counts.array.tolist(),
+            "labelled": self._labelled.array[:, 0].astype(int).tolist(),
+        }
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> PublishedSegmentation:
+        """Read what `state` returned."""
+        metric = cls(state["batch_size"])
+        metric._counts.append(np.asarray(state["counts"], np.int64).reshape(-1, 4))
+        metric._labelled.append(np.asarray(state["labelled"], np.bool_).reshape(-1, 1))
+        return metric
+
+
+@dataclasses.dataclass(frozen=True)
+class PublishedDetectionScores:
+    """Published detection scores, in [0, 1]; NaN without a true box.
+
+    Attributes:
+        images: Labelled images.
+        not_labelled: Images without truth, left out.
+        objects: True boxes.
+        boxes: Predicted boxes.
+        recall: Of all boxes at IoU 0.5, mean over classes.
+        precision: Of all boxes at IoU 0.5, mean over classes.
+        map50: AP at IoU 0.5, mean over classes.
+        map: Mean AP over IoU 0.50, 0.55, ..., 0.95 and classes.
+    """
+
+    images: int
+    not_labelled: int
+    objects: int
+    boxes: int
+    recall: float
+    precision: float
+    map50: float
+    map: float
+
+
+class PublishedDetection:
+    """The published detection figures, an image at a time.
+
+    Args:
+        classes: Number of classes.
+    """
+
+    def __init__(self, classes: int = 1) -> None:
+        self.classes = classes
+        self._thresholds = np.array(IOU_THRESHOLDS)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._scores = Rows(1, np.float32)
+        self._image = Rows(1, np.int32)
+        self._class = Rows(1, np.int16)
+        self._right = Rows(1, np.uint16)  # one bit an IoU threshold
+        self._objects = Rows(self.classes, np.int32)
+        self._labelled = Rows(1, np.bool_)
+
+    def __len__(self) -> int:
+        return len(self._labelled)
+
+    def update(
+        self,
+        boxes: NDArray[Any] | None,
+        scores: NDArray[Any] | None,
+        class_id: NDArray[Any] | None,
+        truth: NDArray[Any] | None,
+        truth_class: NDArray[Any] | None,
+    ) -> None:
+        """Add an image.
+
+        Args:
+            boxes: (D, 4) predicted left, top, right, bottom in pixels of the image; None if the model gave none.
+            scores: (D,) objectness x class score.
+            class_id: (D,)
+            truth: (G, 4) true boxes; None = not labelled.
+            truth_class: (G,)
+
+        Raises:
+            ShapeError: If scores, class ids and boxes differ in number.
+        """
+        if boxes is None or scores is None or class_id is None or truth is None or truth_class is None:
+            self._objects.append(np.zeros(self.classes, np.int32))
+            self._labelled.append(False)
+            return
+        if not len(boxes) == len(scores) == len(class_id) or len(truth) != len(truth_class):
+            raise ShapeError("boxes, scores and class ids must be as many as each other")
+        order = np.argsort(-np.asarray(scores, np.float32), kind="stable")
+        boxes, scores, class_id = np.asarray(boxes)[order], np.asarray(scores)[order], np.asarray(class_id)[order]
+        right = np.zeros(len(boxes), np.uint16)
+        bits = (1 << np.arange(len(self._thresholds))).astype(np.uint16)
+        for number in np.unique(truth_class):
+            targets = np.asarray(truth, np.float64)[np.asarray(truth_class) == number]
+            picked = np.flatnonzero(np.asarray(class_id) == number)
+            overlap = box_overlap(np.asarray(boxes, np.float64)[picked], targets)
+            best = overlap.argmax(axis=1)
+            value = overlap[np.arange(len(picked)), best]
+            tries = np.flatnonzero(value > self._thresholds[0])
+            _, first = np.unique(best[tries], return_index=True)  # the best-scored box of those that want one target
+            for row in tries[first]:
+                right[picked[row]] = (bits * (value[row] > self._thresholds)).sum()
+        if len(boxes):
+            self._scores.append(np.asarray(scores, np.float32)[:, None])
+            self._class.append(np.asarray(class_id)[:, None])
+            self._right.append(right[:, None])
+            self._image.append(np.full((len(boxes), 1), len(self._labelled)))
+        self._objects.append(np.bincount(np.asarray(truth_class, np.int64), minlength=self.classes))
+        self._labelled.append(True)
+
+    def figures(self, weights: NDArray[Any] | None = None) -> dict[str, FloatArray]:
+        """Return figures by name under R weightings of the images at once.
+
+        Args:
+            weights: (R, N) how often each image counts; None for once each.
+
+        Returns:
+            Name -> (R,).
+        """
+        objects = weighted_sum(self._objects.array, weights)  # (R, classes)
+        rounds = len(objects)
+        shape = (rounds, self.classes)
+        recall, precision = np.full(shape, np.nan), np.full(shape, np.nan)
+        ap = np.full((*shape, len(self._thresholds)), np.nan)
+        for number in range(self.classes):
+            picked = np.flatnonzero(self._class.array[:, 0] == number)
+            order = picked[np.argsort(-self._scores.array[picked, 0], kind="stable")]
+            image, right = self._image.array[order, 0], self._right.array[order, 0]
+            for row in np.flatnonzero(objects[:, number] > 0):
+                weight = np.ones(len(order)) if weights is None else np.asarray(weights[row], np.float64)[image]
+                for level in range(len(self._thresholds)):
+                    hit = (right >> np.uint16(level)) & np.uint16(1) != 0
+                    found, wrong = np.cumsum(weight * hit), np.cumsum(weight * ~hit)
+                    if not len(found) or found[-1] + wrong[-1] == 0:
+                        recall[row, number] = precision[row, number] = ap[row, number, level] = 0.0
+                        continue
+                    use = weight > 0
+                    curve = found[use] / objects[row, number], found[use] / (found + wrong)[use]
+                    ap[row, number, level] = published_average_precision(*curve)
+                    if level == 0:
+                        recall[row, number], precision[row, number] = curve[0][-1], curve[1][-1]
+        return {
+            "recall": mean_known(recall),
+            "precision": mean_known(precision),
+            "map50": mean_known(ap[:, :, 0]),
+            "map": mean_known(ap.reshape(rounds, -1)),
+        }
+
+    def compute(self) -> PublishedDetectionScores:
+        """Return the scores over all images."""
+        labelled = self._labelled.array[:, 0]
+        return PublishedDetectionScores(
+            images=int(labelled.sum()),
+            not_labelled=int((~labelled).sum()),
+            objects=int(self._objects.array.sum()),
+            boxes=len(self._scores),
+            **{name: float(value[0]) for name, value in self.figures().items()},
+        )
+
+    def state(self) -> dict[str, Any]:
+        """Return what was kept, as ``json.dumps`` takes it."""
+        return {
+            "classes": self.classes,
+            "scores": [float(f"{score:.9g}") for score in self._scores.array[:, 0]],
+            "image": self._image.array[:, 0].tolist(),
+            "class_id": self._class.array[:, 0].tolist(),
+            "right": self._right.array[:, 0].tolist(),
+            "objects": self._objects.array.tolist(),
+            "labelled": self._labelled.array[:, 0].astype(int).tolist(),
+        }
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> PublishedDetection:
+        """Read what `state` returned."""
+        metric = cls(state["classes"])
+        metric._scores.append(np.asarray(state["scores"], np.float32).reshape(-1, 1))
+        metric._image.append(np.asarray(state["image"], np.int32).reshape(-1, 1))
+        metric._class.append(np.asarray(state["class_id"], np.int16).reshape(-1, 1))
+        metric._right.append(np.asarray(state["right"], np.uint16).reshape(-1, 1))
+        metric._objects.append(np.asarray(state["objects"], np.int32).reshape(-1, metric.classes))
+        metric._labelled.append(np.asarray(state["labelled"], np.bool_).reshape(-1, 1))
+        return metric
+
+
+def published_average_precision(recall: FloatArray, precision: FloatArray) -> float:
+    """Return the published average precision of one curve.
+
+    Args:
+        recall: (K,) rising, K at least 1.
+        precision: (K,)
+
+    Returns:
+        In [0, 1].
+    """
+    along = np.concatenate([[0.0], recall, [recall[-1] + 1e-3]])
+    envelope = np.concatenate([[1.0], precision, [0.0]])
+    envelope = np.maximum.accumulate(envelope[::-1])[::-1]
+    points = np.linspace(0, 1, 101)
+    values = np.interp(points, along, envelope)
+    return float(((values[1:] + values[:-1]) / 2 * np.diff(points)).sum())
