@@ -256,7 +256,7 @@ def render(parts: list[Any]) -> str:
 
 def percent(value: float | None, digits: int = 1) -> str:
     """Return a ratio as per cent, a dash where it is undefined."""
-    return "–" if value is None or math.isnan(value) else f"{100 * value:.{digits}f}"
+    return "-" if value is None or math.isnan(value) else f"{100 * value:.{digits}f}"
 
 
 def _figure_table(protocol: str, figures: Mapping[str, Figure]) -> Table:

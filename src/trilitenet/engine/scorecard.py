@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from trilitenet.config import TASKS, Task, Thresholds
 from trilitenet.engine.overlays import error_overlay
@@ -189,7 +190,7 @@ class Scorecard:
 def _detection_plots(metric: DetectionMetric) -> DetectionPlots:
     curve = metric.curve()
     count = len(curve.confidence)
-    picked = np.unique(np.linspace(0, count - 1, min(count, _CURVE_POINTS)).astype(np.int64)) if count else []
+    picked: NDArray[np.int64] = np.unique(np.linspace(0, max(count - 1, 0), min(count, _CURVE_POINTS)).astype(np.int64))
     right, wrong = metric.histogram(20)
     return DetectionPlots(
         recall=tuple(float(value) for value in curve.recall[picked]),

@@ -269,7 +269,7 @@ class DetectionMetric:
         """Match sorted boxes to true ones of any class at IoU 0.5, into the confusion matrix."""
         background = len(self.class_names)
         overlap = box_overlap(boxes, np.asarray(truth, np.float64).reshape(-1, 4))
-        covered: NDArray[np.bool_] = (box_cover(boxes, regions) >= 0.5).any(axis=1)
+        covered: NDArray[np.bool_] = np.max(box_cover(boxes, regions), axis=1, initial=0) >= 0.5
         classes = np.asarray(truth_class, np.int64)
         free: NDArray[np.bool_] = np.ones(len(truth), np.bool_)
         right = wrong = 0
