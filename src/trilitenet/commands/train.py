@@ -130,14 +130,17 @@ def _validation(
     dataset = DrivingDataset(config.data, config.val_split, class_names=names)
 
     def validate(network: TriLiteNet) -> dict[str, float]:
-        scores = evaluate(Predictor(TorchBackend(network, device)), dataset, batch_size=8)
+        predictor = Predictor(TorchBackend(network, device))
+        scores = evaluate(predictor, dataset, batch_size=8, resamples=0, worst=0).fair
         figures: dict[str, float] = {}
+        if scores is None:
+            return figures
         if scores.detection is not None:
             figures |= {"detection/ap50": scores.detection.ap50, "detection/recall": scores.detection.recall_all}
         if scores.drivable is not None:
             figures |= {"drivable/miou": scores.drivable.miou}
         if scores.lane is not None:
-            figures |= {"lane/accuracy": scores.lane.balanced_accuracy, "lane/iou": scores.lane.iou}
+            figures |= {"lane/iou": scores.lane.as_labelled.iou, "lane/f1_2px": scores.lane.f1}
         return figures
 
     return validate
@@ -146,7 +149,7 @@ def _validation(
 def _flags(config: type[Any], prefix: str = "") -> list[inspect.Parameter]:
     """Return one keyword-only parameter a field of a configuration class, its help taken from the docstring."""
     hints = get_type_hints(config)
-    helps = dict(re.findall(r"^ {8}(\w+): ((?:.|\n {12})*)", inspect.getdoc(config) and config.__doc__ or "", re.M))
+    helps = dict(re.findall(r"^ {8}(\w+): ((?:.|\n {12})*)", config.__doc__ or "", re.M))
     flags: list[inspect.Parameter] = []
     for field in dataclasses.fields(config):
         default = field.default
