@@ -143,11 +143,12 @@ def _scalabel_boxes(categories: tuple[str, ...]) -> list[dict[str, Any]]:
 
 
 def _scalabel_lanes(category: str | None) -> list[dict[str, Any]]:
+    type_key = "laneTypes" if category is None else "laneType"
     return [
         {
             "id": str(i),
             "category": category or lane,
-            "attributes": {"laneDirection": direction, "laneStyle": style, "laneTypes" if category is None else "laneType": lane},
+            "attributes": {"laneDirection": direction, "laneStyle": style, type_key: lane},
             "poly2d": new_poly(points, types, closed=False),
         }
         for i, (lane, style, direction, points, types) in enumerate(LANES)

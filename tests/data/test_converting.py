@@ -120,7 +120,7 @@ def test_widths_differ_by_split(tmp_path: Path) -> None:
         path.write_text(json.dumps([{"name": "x.jpg", "labels": [curb]}]))
     convert(read_bdd100k(raw), tmp_path / "out")
     widths = {
-        split: int((cv2.imread(str(tmp_path / f"out/ll_seg_annotations/{split}/x.png"), 0)[400] > 0).sum())
+        split: int((DrivingDataset(tmp_path / "out", split)[0].lane[400] > 0).sum())  # type: ignore[index]
         for split in ("train", "val")
     }
     assert widths == {"train": 8, "val": 2}

@@ -63,11 +63,11 @@ def test_nearest_first_would_be_wrong() -> None:
 
 def test_far_apart_or_crossing_or_following_lines_stay_alone() -> None:
     wall = np.array([[0.0, 0.0], [0.0, 200.0]])
-    assert pair_edges([wall, wall + (60, 0)]).single == (0, 1)
+    assert pair_edges([wall, wall + np.array([60.0, 0.0])]).single == (0, 1)
     assert pair_edges([wall, np.array([[-100.0, 100.0], [100.0, 100.0]])]).pairs == ()
     dashes = [np.array([[0.0, y], [0.0, y + 20.0]]) for y in (0.0, 30.0, 60.0)]
     assert pair_edges(dashes).pairs == ()
-    assert edge_gap(wall, wall + (12, 0)) == pytest.approx(12)
+    assert edge_gap(wall, wall + np.array([12.0, 0.0])) == pytest.approx(12)
 
 
 def test_dashes_side_by_side_pair_within_each_dash() -> None:

@@ -137,7 +137,8 @@ def _end(
     # Where both edges end together, slanting ends leave a little of one of them over.
     if len(rest) * _SPACING <= max(2 * float(np.hypot(*offset)), _SPACING):
         return (one[-1:] + two[-1:]) / 2
-    return rest + offset
+    moved: NDArray[np.float64] = rest + offset
+    return moved
 
 
 def _length(line: NDArray[np.float64]) -> float:

@@ -1,6 +1,7 @@
 """Transforms of a sample: one draw of random numbers for the image, its boxes and its masks.
 
-The published recipe (letterbox, one affine map, HSV gains, left-right flip) is `TrainTransform` with its defaults.
+The published recipe (letterbox, one affine map, HSV gains, left-right flip) is `TrainTransform` with its defaults;
+mosaic, mix-up, weather and other light are there and off.
 Every geometric step is one 2x3 matrix from source pixels to canvas pixels, applied to all of them alike; pixel centres
 are at integer coordinates in the matrix and boxes are measured from the corner of the first pixel, so a box's edges
 are moved by half a pixel before and after.
@@ -9,14 +10,15 @@ are moved by half a pixel before and after.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, Final, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import MAX_STRIDE
+from trilitenet.data import photometric
 from trilitenet.data.sample import Sample
 from trilitenet.errors import ConfigError
 from trilitenet.processing.letterbox import PAD_VALUE, Letterbox
@@ -31,9 +33,25 @@ __all__ = [
     "flip",
     "hsv",
     "kept_boxes",
+    "mixup",
+    "mosaic",
     "shift_hsv",
     "warp",
 ]
+
+
+_PHOTOMETRIC: Final = {
+    "night": photometric.night,
+    "fog": photometric.fog,
+    "rain": photometric.rain,
+    "light": photometric.light,
+    "blur": photometric.blur,
+    "noise": photometric.noise,
+}
+"""Steps that move nothing, in the order they are applied: what happens outside before what the camera does."""
+
+_JOINS_TRIED: Final = 8
+"""So many samples are drawn to find one with labels for the same tasks."""
 
 
 class Transform(Protocol):
@@ -59,6 +77,14 @@ class Augmentation:
         flip: Probability of a left-right flip.
         mask_above: A warped mask pixel (0 to 255) above this is foreground. The published 1 thickens masks by up to a
             pixel; 127 keeps their area.
+        light: Probability of another exposure (brightness, contrast, gamma).
+        blur: Probability of a Gaussian or motion blur.
+        noise: Probability of sensor noise and JPEG blocks.
+        rain: Probability of rain.
+        fog: Probability of fog.
+        night: Probability of darkness.
+        mosaic: Probability that four samples share the canvas.
+        mixup: Probability that a second sample shines through.
     """
 
     rotation: float = 10.0
@@ -69,6 +95,14 @@ class Augmentation:
     value: float = 0.4
     flip: float = 0.5
     mask_above: int = 1
+    light: float = 0.0
+    blur: float = 0.0
+    noise: float = 0.0
+    rain: float = 0.0
+    fog: float = 0.0
+    night: float = 0.0
+    mosaic: float = 0.0
+    mixup: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.scale < 1:
@@ -78,7 +112,7 @@ class Augmentation:
         for name in ("rotation", "translation", "hue", "saturation", "value"):
             if getattr(self, name) < 0:
                 raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
-        for name in ("flip",):
+        for name in ("flip", *_PHOTOMETRIC, "mosaic", "mixup"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"{name} is a probability, in [0, 1], got {getattr(self, name)}")
 
@@ -147,7 +181,11 @@ def warp(sample: Sample, affine: Affine, canvas: tuple[int, int], mask_above: in
     }
     image, moved = _warp_together(
         _resize(sample.image, box),
-        {name: _resize_mask(mask, box, mask_above) for name, mask in masks.items() if mask is not None},
+        {
+            name: _resize_mask(mask, box, 1 if name == "valid" else mask_above)
+            for name, mask in masks.items()
+            if mask is not None
+        },
         matrix,
         canvas,
     )
@@ -268,7 +306,7 @@ class EvalTransform:
 
 @dataclasses.dataclass(frozen=True)
 class TrainTransform:
-    """The published augmentation: letterbox, one affine map, HSV gains, flip.
+    """The published augmentation: letterbox, one affine map, HSV gains, flip; and more if asked for.
 
     Attributes:
         canvas: (height, width) of the result in pixels, multiples of 32.
@@ -285,8 +323,151 @@ class TrainTransform:
         self, sample: Sample, rng: np.random.Generator, draw: Callable[[np.random.Generator], Sample] | None = None
     ) -> Sample:
         """Return an augmented sample at canvas size."""
-        moved = warp(sample, draw_affine(rng, self.strength), self.canvas, self.strength.mask_above)
-        return dataclasses.replace(moved, image=hsv(moved.image, rng, self.strength))
+        strength = self.strength
+        if draw is not None and strength.mosaic and rng.random() < strength.mosaic:
+            moved = self._mosaic(sample, rng, draw)
+        else:
+            moved = self._warp(sample, rng)
+        if draw is not None and strength.mixup and rng.random() < strength.mixup:
+            other = _alike(sample, rng, draw)
+            if other is not None:
+                moved = mixup(moved, self._warp(other, rng), rng)
+        image = hsv(moved.image, rng, strength)
+        for name, step in _PHOTOMETRIC.items():
+            probability = getattr(strength, name)
+            if probability and rng.random() < probability:
+                image = step(image, rng)
+        return dataclasses.replace(moved, image=image)
+
+    def _warp(self, sample: Sample, rng: np.random.Generator) -> Sample:
+        return warp(sample, draw_affine(rng, self.strength), self.canvas, self.strength.mask_above)
+
+    def _mosaic(
+        self, sample: Sample, rng: np.random.Generator, draw: Callable[[np.random.Generator], Sample]
+    ) -> Sample:
+        others = [_alike(sample, rng, draw) for _ in range(3)]
+        tiles = [sample, *(other for other in others if other is not None)]
+        moved = [self._warp(tile, rng) for tile in tiles]
+        return mosaic(moved, rng) if len(moved) == 4 else moved[0]
+
+
+def mosaic(tiles: Sequence[Sample], rng: np.random.Generator) -> Sample:
+    """Put a part of each of four samples into one canvas, about a random point near its middle.
+
+    Args:
+        tiles: Four samples of one size, labelled for the same tasks.
+        rng: Draws the point, and which part of each sample is shown.
+
+    Returns:
+        A sample of that size with the first one's name and attributes.
+    """
+    height, width = tiles[0].size
+    split_y, split_x = int(rng.uniform(0.35, 0.65) * height), int(rng.uniform(0.35, 0.65) * width)
+    places = [
+        (slice(0, split_y), slice(0, split_x)),
+        (slice(0, split_y), slice(split_x, width)),
+        (slice(split_y, height), slice(0, split_x)),
+        (slice(split_y, height), slice(split_x, width)),
+    ]
+    parts = []
+    for tile, (rows, columns) in zip(tiles, places, strict=True):
+        top = int(rng.integers(height - (rows.stop - rows.start) + 1))
+        left = int(rng.integers(width - (columns.stop - columns.start) + 1))
+        parts.append(_crop(tile, top, left, rows.stop - rows.start, columns.stop - columns.start))
+    first = parts[0]
+
+    def join(arrays: list[NDArray[Any]]) -> NDArray[Any]:
+        return np.concatenate([np.concatenate(arrays[:2], axis=1), np.concatenate(arrays[2:], axis=1)], axis=0)
+
+    def shifted(boxes: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+        corners = [(columns.start, rows.start) * 2 for rows, columns in places]
+        moved = [part + np.array(corner, np.float32) for part, corner in zip(boxes, corners, strict=True)]
+        return np.concatenate(moved)
+
+    def joined(name: str) -> Any:
+        arrays = [getattr(part, name) for part in parts]
+        if all(array is None for array in arrays):
+            return None
+        if name == "valid":
+            arrays = [np.ones(p.size, np.bool_) if a is None else a for a, p in zip(arrays, parts, strict=True)]
+        return join(arrays)
+
+    return dataclasses.replace(
+        tiles[0],
+        image=join([part.image for part in parts]),
+        boxes=None if first.boxes is None else shifted([part.boxes for part in parts if part.boxes is not None]),
+        class_id=None
+        if first.class_id is None
+        else np.concatenate([part.class_id for part in parts if part.class_id is not None]),
+        ignored=shifted([part.ignored for part in parts]),
+        drivable=joined("drivable"),
+        lane=joined("lane"),
+        valid=joined("valid"),
+    )
+
+
+def mixup(one: Sample, two: Sample, rng: np.random.Generator) -> Sample:
+    """Let a second sample shine through the first.
+
+    Boxes of both count. Masks are those of the first, which is always the stronger: a blend has no half labels.
+
+    Args:
+        one: Weighs 0.5 or more.
+        two: Of the same size, labelled for the same tasks.
+        rng: Draws the weight: Beta(8, 8), mirrored to 0.5 or more.
+    """
+    weight = float(rng.beta(8.0, 8.0))
+    weight = max(weight, 1 - weight)
+    boxes, class_id = one.boxes, one.class_id
+    if boxes is not None and class_id is not None and two.boxes is not None and two.class_id is not None:
+        boxes = np.concatenate([boxes, two.boxes])
+        class_id = np.concatenate([class_id, two.class_id])
+    return dataclasses.replace(
+        one,
+        image=cv2.addWeighted(one.image, weight, two.image, 1 - weight, 0),
+        boxes=boxes,
+        class_id=class_id,
+        ignored=np.concatenate([one.ignored, two.ignored]),
+    )
+
+
+def _alike(sample: Sample, rng: np.random.Generator, draw: Callable[[np.random.Generator], Sample]) -> Sample | None:
+    """Draw a sample that is labelled for the same tasks, if one turns up."""
+    for _ in range(_JOINS_TRIED):
+        other = draw(rng)
+        if all((getattr(other, name) is None) == (getattr(sample, name) is None) for name in _LABELS):
+            return other
+    return None
+
+
+_LABELS: Final = ("boxes", "drivable", "lane")
+
+
+def _crop(sample: Sample, top: int, left: int, height: int, width: int) -> Sample:
+    """Cut a part out of a sample; boxes of which too little is left are gone."""
+    area = np.s_[top : top + height, left : left + width]
+
+    def cut(boxes: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        moved = boxes - np.array([left, top, left, top], np.float32)
+        return moved, np.clip(moved, 0, np.array([width, height, width, height], np.float32))
+
+    boxes, class_id = sample.boxes, sample.class_id
+    if boxes is not None and class_id is not None:
+        moved, boxes = cut(boxes)
+        keep = kept_boxes(moved, boxes)
+        boxes, class_id = boxes[keep], class_id[keep]
+    _, ignored = cut(sample.ignored)
+    ignored = ignored[(ignored[:, 2] > ignored[:, 0]) & (ignored[:, 3] > ignored[:, 1])]
+    return dataclasses.replace(
+        sample,
+        image=sample.image[area],
+        boxes=boxes,
+        class_id=class_id,
+        ignored=ignored,
+        drivable=None if sample.drivable is None else sample.drivable[area],
+        lane=None if sample.lane is None else sample.lane[area],
+        valid=None if sample.valid is None else sample.valid[area],
+    )
 
 
 def _check_canvas(canvas: tuple[int, int]) -> None:
