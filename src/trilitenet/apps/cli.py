@@ -4,8 +4,9 @@ A command is one line of `COMMANDS`. Its flags are the function's parameters and
 Python API and the command line agree by construction. The function's module is imported only when its command is
 called: ``trilitenet --help`` reads the summaries from the sources and loads neither PyTorch nor any other runtime.
 
-What a command returns is shown by its ``summary()`` (or as it is, if it is text), and ends with ``exit_code`` where it
-has one. Exit codes: 0 done; 1 an error, told in one line; 2 a wrong command line; 130 interrupted.
+What a command returns is shown by its ``summary()`` (or as it is, if it is text), followed by its ``errors``, and ends
+with ``exit_code`` where it has one. Exit codes: 0 done; 1 an error, told in one line; 2 a wrong command line; 130
+interrupted.
 """
 
 from __future__ import annotations
@@ -33,24 +34,26 @@ class Command(NamedTuple):
 
     Attributes:
         words: What the user types after ``trilitenet``.
-        module: The module in `trilitenet.commands` that has the function.
+        module: The module that has the function.
         function: The function's name.
+        package: The package of the module, below `trilitenet`; not ``commands`` only for a verb that is an application.
     """
 
     words: str
     module: str
     function: str
+    package: str = "commands"
 
     def load(self) -> Callable[..., Any]:
         """Import the function."""
         function: Callable[..., Any] = getattr(
-            importlib.import_module(f"trilitenet.commands.{self.module}"), self.function
+            importlib.import_module(f"trilitenet.{self.package}.{self.module}"), self.function
         )
         return function
 
     def read_summary(self) -> str:
         """Return the first line of the function's docstring, read from its source without importing it."""
-        source = Path(trilitenet.__file__).parent / "commands" / f"{self.module}.py"
+        source = Path(trilitenet.__file__).parent.joinpath(*self.package.split("."), f"{self.module}.py")
         for node in ast.parse(source.read_text(encoding="utf-8")).body:
             if isinstance(node, ast.FunctionDef) and node.name == self.function:
                 return (ast.get_docstring(node) or "").partition("\n")[0]
@@ -59,6 +62,8 @@ class Command(NamedTuple):
 
 COMMANDS: Final[tuple[Command, ...]] = (
     Command("data synthesize", "synthesize", "synthesize"),
+    Command("predict", "predict", "predict"),
+    Command("serve", "command", "serve", package="apps.server"),
     Command("train", "train", "train"),
     Command("weights import", "weights", "import_weights"),
     Command("weights info", "weights", "info"),
@@ -85,6 +90,7 @@ def build_app(words: Sequence[str] = (), *, everything: bool = False) -> cyclopt
         help="Light driving perception: vehicles, drivable area and lane lines from one tiny network.",
         version=f"trilitenet {trilitenet.__version__}",
         help_format="markdown",
+        default_parameter=cyclopts.Parameter(negative_iterable=()),
         help_on_error=False,
         suppress_keyboard_interrupt=False,
     )
@@ -122,6 +128,8 @@ def main(words: Sequence[str] | None = None) -> int:
         result = app(words, print_error=False, exit_on_error=False, verbose=False, result_action="return_value")
         sys.stdout.write(_shown(result))
         sys.stdout.flush()
+        for line in getattr(result, "errors", ()):
+            sys.stderr.write(f"error: {line}\n")
     except _MisuseError as error:
         return _fail(str(error), code=2)
     except CycloptsError as error:

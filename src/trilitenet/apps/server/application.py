@@ -1,0 +1,111 @@
+"""Put the parts together: a predictor and settings in, an ASGI application out."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+from starlette.types import Receive, Scope, Send
+
+from trilitenet import __version__
+from trilitenet.apps.server.guard import Guard
+from trilitenet.apps.server.inference_protocol import protocol_router
+from trilitenet.apps.server.pages import pages_router
+from trilitenet.apps.server.problems import ProblemError, problem_response
+from trilitenet.apps.server.rest import rest_router
+from trilitenet.apps.server.service import Service
+from trilitenet.apps.server.settings import Settings
+from trilitenet.inference.predictor import Predictor
+
+__all__ = ["Application", "create_app"]
+
+_DESCRIPTION = """Driving perception of one small network: vehicles, drivable area and lane markings.
+
+Images are JPEG, PNG or WebP. Coordinates are pixels of the image as it is shown (EXIF rotation applied).
+Errors have one form, `{"error": {"code", "message", "request_id"}}`, and 503 comes with `Retry-After`.
+"""
+
+
+class Application:
+    """The ASGI application: the routes inside the guard.
+
+    Attributes:
+        service: The predictor behind its queue.
+        api: The FastAPI application, for its OpenAPI schema.
+    """
+
+    def __init__(self, service: Service) -> None:
+        self.service = service
+        self.api = _routes(service)
+        self._guard = Guard(self.api, service)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request, or the lifespan of the process."""
+        await self._guard(scope, receive, send)
+
+
+def create_app(predictor: Predictor, name: str, settings: Settings | None = None) -> Application:
+    """Build the service around a predictor.
+
+    Args:
+        predictor: As `trilitenet.load` returns it.
+        name: What clients call the model.
+        settings: Limits; the defaults if left out.
+    """
+    return Application(Service(predictor, name, settings or Settings()))
+
+
+def _routes(service: Service) -> FastAPI:
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        await service.start()
+        yield
+        await service.stop()
+
+    # The interactive documentation of FastAPI loads scripts from elsewhere, so there is only the schema.
+    api = FastAPI(
+        title="TriLiteNet",
+        version=__version__,
+        description=_DESCRIPTION,
+        docs_url=None,
+        redoc_url=None,
+        lifespan=lifespan,
+    )
+    api.include_router(rest_router(service))
+    api.include_router(protocol_router(service))
+    api.include_router(pages_router())
+    api.add_exception_handler(ProblemError, _on_problem)
+    api.add_exception_handler(RequestValidationError, _on_invalid)
+    api.add_exception_handler(HTTPException, _on_http)
+    api.add_exception_handler(Exception, _on_error)
+    return api
+
+
+async def _on_problem(request: Request, error: Exception) -> Response:
+    assert isinstance(error, ProblemError)
+    return problem_response(request, error)
+
+
+async def _on_invalid(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    first = error.errors()[0]
+    name = str(first["loc"][-1])
+    return problem_response(request, ProblemError(422, "bad_parameter", f"{name}: {first['msg']}"))
+
+
+async def _on_http(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    code = {404: "not_found", 405: "method_not_allowed"}.get(error.status_code, "http")
+    return problem_response(
+        request, ProblemError(error.status_code, code, str(error.detail), dict(error.headers or {}))
+    )
+
+
+async def _on_error(request: Request, error: Exception) -> Response:
+    return problem_response(
+        request, ProblemError(500, "internal", "the service failed on this request; its log says why")
+    )

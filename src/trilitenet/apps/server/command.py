@@ -1,0 +1,93 @@
+"""``trilitenet serve``: the verb lives beside the service, because commands never import applications."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from trilitenet.errors import ConfigError, InputError, import_extra
+
+__all__ = ["serve"]
+
+
+def serve(
+    *,
+    model: str = "small",
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    device: str = "auto",
+    backend: str = "auto",
+    confidence: float | None = None,
+    token_file: Path | None = None,
+    queue: int = 64,
+    max_batch: int = 8,
+    batch_delay: float = 0.0,
+    deadline: float = 10.0,
+    max_body: int = 20 * 2**20,
+    max_pixels: int = 7680 * 4320,
+    drain: float = 1.0,
+    log_level: str = "info",
+) -> None:
+    """Serve a model over HTTP: a REST interface, the Open Inference Protocol, and a page for people at ``/``.
+
+    The process runs until it is told to stop (Ctrl-C or SIGTERM), and then finishes what it accepted. Logs go to
+    standard error, one JSON object a line.
+
+    Args:
+        model: A shipped model, a file of weights, or an exported artefact.
+        host: Address to listen on; 0.0.0.0 lets other machines in.
+        port: Port to listen on.
+        device: Where the network runs, as for predict.
+        backend: The runtime, as for predict.
+        confidence: Boxes above this are kept; the model's own threshold if left out.
+        token_file: File with the bearer token that clients must bring (or set TRILITENET_TOKEN).
+        queue: At most so many images are accepted and not yet answered; one more gets 503.
+        max_batch: At most so many images go through the network at once.
+        batch_delay: Seconds that a batch that is not full waits for company.
+        deadline: Seconds after which an accepted image that is not through gets 503.
+        max_body: Bytes of one request.
+        max_pixels: Pixels of one image.
+        drain: Seconds that the service still accepts after it was told to stop.
+        log_level: What is logged: debug, info, warning or error.
+
+    Raises:
+        ConfigError: If a limit is out of range, or the token too short.
+        MissingExtraError: If the extra "serve" is not installed.
+    """
+    for module in ("fastapi", "uvicorn", "httptools", "prometheus_client"):
+        import_extra(module, "serve")
+    import cv2
+
+    from trilitenet.apps.server.application import create_app
+    from trilitenet.apps.server.process import build_server, set_up_logs
+    from trilitenet.apps.server.settings import Settings
+    from trilitenet.commands.load import load
+
+    if log_level not in {"debug", "info", "warning", "error"}:
+        raise ConfigError(f"log_level must be debug, info, warning or error, got {log_level!r}")
+    settings = Settings(
+        queue=queue,
+        max_batch=max_batch,
+        batch_delay=batch_delay,
+        deadline=deadline,
+        max_body=max_body,
+        max_pixels=max_pixels,
+        max_images=min(Settings.max_images, queue),
+        drain=drain,
+        token=_read_token(token_file),
+    )
+    set_up_logs(log_level.upper())
+    cv2.setNumThreads(1)  # images are the unit of parallel work here
+    predictor = load(model, device=device, backend=backend, confidence=confidence)
+    with predictor:
+        build_server(create_app(predictor, Path(model).stem, settings), host, port).run()
+
+
+def _read_token(file: Path | None) -> str | None:
+    """Return the bearer token. It is not taken from the command line, where other users could read it."""
+    if file is None:
+        return os.environ.get("TRILITENET_TOKEN") or None
+    try:
+        return file.read_text(encoding="utf-8").strip()
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror or error})") from error

@@ -1,0 +1,319 @@
+"""The Open Inference Protocol, version 2, below ``/v2``: what clients of KServe and Triton speak.
+
+The model has one input, ``image``: UINT8 (B, H, W, 3) RGB, or BYTES (B) with encoded images of one size. Its outputs
+are in pixels of that image: ``boxes`` FP32 (B, N, 6) left, top, right, bottom, confidence, class, best first and filled
+up with -1; ``drivable`` and ``lane`` UINT8 (B, H, W), 1 where the task sees something. Tensors travel as JSON or in the
+protocol's binary form.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import binascii
+import json
+import struct
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from fastapi import APIRouter, Request
+from numpy.typing import NDArray
+from starlette.responses import JSONResponse, Response
+
+from trilitenet import __version__
+from trilitenet.apps.server import openapi
+from trilitenet.apps.server.intake import BYTES_PER_PIXEL, Header, Reservation, check_header, read_header
+from trilitenet.apps.server.problems import ProblemError
+from trilitenet.apps.server.rest import read_request, until_vanished
+from trilitenet.apps.server.service import Encoded, Outcome, Service
+from trilitenet.apps.server.settings import Settings
+from trilitenet.config import ModelCard
+from trilitenet.structures import Perception
+
+__all__ = ["protocol_router"]
+
+_HEADER_LENGTH: Final = "inference-header-content-length"
+_VERSION: Final = "1"
+
+
+class _Query(NamedTuple):
+    """A parsed inference request: images, and for each output whether it is wanted in binary form."""
+
+    identifier: str | None
+    images: list[Encoded | NDArray[np.uint8]]
+    size: tuple[int, int]
+    outputs: dict[str, bool]
+
+
+def protocol_router(service: Service) -> APIRouter:
+    """Return the routes of ``/v2``."""
+    router = APIRouter(tags=["open inference protocol"])
+    names = _output_names(service.card)
+
+    @router.get("/v2", **openapi.ANY)
+    async def server_metadata() -> Response:
+        return JSONResponse({"name": "trilitenet", "version": __version__, "extensions": ["binary_tensor_data"]})
+
+    @router.get("/v2/health/live", **openapi.ANY)
+    async def live() -> Response:
+        return JSONResponse({"live": service.alive}, status_code=200 if service.alive else 503)
+
+    @router.get("/v2/health/ready", **openapi.ANY)
+    async def ready() -> Response:
+        return JSONResponse({"ready": service.ready}, status_code=200 if service.ready else 503)
+
+    @router.get("/v2/models/{model}", **openapi.ANY)
+    @router.get("/v2/models/{model}/versions/{version}", **openapi.ANY)
+    async def model_metadata(model: str, version: str = _VERSION) -> Response:
+        _check_model(service, model, version)
+        return JSONResponse(_metadata(service.name, names))
+
+    @router.get("/v2/models/{model}/ready", **openapi.ANY)
+    @router.get("/v2/models/{model}/versions/{version}/ready", **openapi.ANY)
+    async def model_ready(model: str, version: str = _VERSION) -> Response:
+        _check_model(service, model, version)
+        return JSONResponse({"name": model, "ready": service.ready}, status_code=200 if service.ready else 503)
+
+    @router.post("/v2/models/{model}/infer", **openapi.INFER)
+    @router.post("/v2/models/{model}/versions/{version}/infer", **openapi.INFER)
+    async def infer(request: Request, model: str, version: str = _VERSION) -> Response:
+        _check_model(service, model, version)
+        with Reservation(service.memory) as reservation:
+            body = await read_request(request, service, reservation)
+            split = _json_length(request.headers.get(_HEADER_LENGTH), len(body))
+            reservation.take(8 * split)  # numbers in JSON grow when they are parsed
+            query = await service.in_pool(_parse, body, split, names, service.settings)
+            reservation.take(len(query.images) * query.size[0] * query.size[1] * BYTES_PER_PIXEL)
+            with service.admit(len(query.images)) as deadline:
+                jobs = [service.see(image, deadline, _perception) for image in query.images]
+                perceptions = await until_vanished(request, asyncio.gather(*jobs))
+            return await service.in_pool(_answer, service.name, query, perceptions)
+
+    return router
+
+
+def _perception(outcome: Outcome) -> Perception:
+    return outcome.perception
+
+
+def _check_model(service: Service, model: str, version: str) -> None:
+    if model != service.name:
+        raise ProblemError(404, "unknown_model", f"there is no model {model[:40]!r}; this service has {service.name!r}")
+    if version != _VERSION:
+        raise ProblemError(404, "unknown_version", f"there is no version {version[:40]!r}; this model has {_VERSION!r}")
+
+
+def _output_names(card: ModelCard) -> tuple[str, ...]:
+    return tuple({"detection": "boxes"}.get(task, task) for task in card.tasks)
+
+
+def _metadata(name: str, names: Sequence[str]) -> dict[str, Any]:
+    shapes: dict[str, tuple[str, list[int]]] = {"boxes": ("FP32", [-1, -1, 6])}
+    outputs = []
+    for output in names:
+        datatype, shape = shapes.get(output, ("UINT8", [-1, -1, -1]))
+        outputs.append({"name": output, "datatype": datatype, "shape": shape})
+    return {
+        "name": name,
+        "versions": [_VERSION],
+        "platform": "trilitenet",
+        "inputs": [{"name": "image", "datatype": "UINT8", "shape": [-1, -1, -1, 3]}],
+        "outputs": outputs,
+    }
+
+
+def _json_length(header: str | None, length: int) -> int:
+    if header is None:
+        return length
+    if not header.isdecimal() or int(header[:20]) > length:
+        raise _bad(f"{_HEADER_LENGTH} must be at most the length of the body, {length}")
+    return int(header)
+
+
+def _parse(body: bytes, split: int, names: Sequence[str], settings: Settings) -> _Query:
+    """Read an inference request.
+
+    Raises:
+        ProblemError: 400 if it is malformed, 413 if an image is too large.
+    """
+    try:
+        mapping = json.loads(body[:split])
+    except (ValueError, RecursionError) as error:
+        raise _bad("the request is not JSON") from error
+    if not isinstance(mapping, dict):
+        raise _bad("the request is not a JSON object")
+    identifier = mapping.get("id")
+    if identifier is not None and not isinstance(identifier, str):
+        raise _bad("id must be a string")
+    inputs = mapping.get("inputs")
+    if not isinstance(inputs, list) or len(inputs) != 1 or not isinstance(inputs[0], dict):
+        raise _bad("inputs must hold one tensor, called image")
+    tensor = inputs[0]
+    if tensor.get("name") != "image":
+        raise _bad(f"unknown input {str(tensor.get('name'))[:40]!r}: call it image")
+    shape = tensor.get("shape")
+    if not isinstance(shape, list) or not all(type(side) is int and 0 < side <= 2**31 for side in shape):
+        raise _bad("shape must be a list of positive numbers")
+    outputs = _wanted(mapping, names)
+    if shape and shape[0] > settings.max_images:
+        raise ProblemError(413, "too_many_images", f"at most {settings.max_images} images are taken at once")
+    if tensor.get("datatype") == "UINT8":
+        images: list[Encoded | NDArray[np.uint8]]
+        images, size = _pixels(tensor, shape, body[split:], settings)
+    elif tensor.get("datatype") == "BYTES":
+        images, size = _files(tensor, shape, body[split:], settings)
+    else:
+        raise _bad("the datatype of image must be UINT8 (pixels) or BYTES (encoded images)")
+    return _Query(identifier, images, size, outputs)
+
+
+def _wanted(mapping: dict[str, Any], names: Sequence[str]) -> dict[str, bool]:
+    """Return the outputs to answer with, and whether each is wanted in binary form."""
+    binary = _flag(mapping, "binary_data_output")
+    outputs = mapping.get("outputs")
+    if outputs is None or outputs == []:
+        return dict.fromkeys(names, binary)
+    if not isinstance(outputs, list) or not all(isinstance(output, dict) for output in outputs):
+        raise _bad("outputs must be a list of objects")
+    wanted: dict[str, bool] = {}
+    for output in outputs:
+        name = output.get("name")
+        if name not in names:
+            raise _bad(f"unknown output {str(name)[:40]!r}; there are {', '.join(names)}")
+        if "classification" in (output.get("parameters") or {}):
+            raise _bad("the classification extension is not supported")
+        wanted[name] = _flag(output, "binary_data", binary)
+    return wanted
+
+
+def _flag(mapping: dict[str, Any], name: str, default: bool = False) -> bool:
+    parameters = mapping.get("parameters")
+    return bool(parameters.get(name, default)) if isinstance(parameters, dict) else default
+
+
+def _binary(tensor: dict[str, Any], rest: bytes) -> bytes | None:
+    """Return the tensor's bytes if it came in binary form."""
+    parameters = tensor.get("parameters")
+    size = parameters.get("binary_data_size") if isinstance(parameters, dict) else None
+    if size is None:
+        return None
+    if size != len(rest):
+        raise _bad(f"binary_data_size is {str(size)[:40]}, {len(rest)} bytes came")
+    return rest
+
+
+def _pixels(
+    tensor: dict[str, Any], shape: list[int], rest: bytes, settings: Settings
+) -> tuple[list[Encoded | NDArray[np.uint8]], tuple[int, int]]:
+    if len(shape) != 4 or shape[3] != 3:
+        raise _bad(f"the shape of image must be [B, H, W, 3], got {shape[:8]}")
+    count, height, width, _ = shape
+    check_header(Header("PNG", width, height, 1), settings)
+    data = _binary(tensor, rest)
+    try:
+        if data is None:
+            values = np.asarray(tensor.get("data"))
+            if values.dtype.kind not in "iu" or (values.size and not (values.min() >= 0 and values.max() <= 255)):
+                raise _bad("data must hold whole numbers from 0 to 255")
+            array = values.astype(np.uint8)
+        else:
+            array = np.frombuffer(data, np.uint8)
+        array = array.reshape(count, height, width, 3)
+    except ValueError as error:
+        raise _bad(f"the data does not fill the shape {shape}") from error
+    return list(array), (height, width)
+
+
+def _files(
+    tensor: dict[str, Any], shape: list[int], rest: bytes, settings: Settings
+) -> tuple[list[Encoded | NDArray[np.uint8]], tuple[int, int]]:
+    data = _binary(tensor, rest)
+    files = _base64(tensor.get("data")) if data is None else _length_prefixed(data)
+    if shape not in ([len(files)], [len(files), 1]) or not files:
+        raise _bad(f"the shape is {shape[:8]}, {len(files)} encoded images came")
+    images: list[Encoded | NDArray[np.uint8]] = []
+    for file in files:
+        header = read_header(file)
+        check_header(header, settings)
+        images.append(Encoded(file, header))
+    # The stored size: EXIF may turn an image, but the reservation and the comparison do not mind.
+    sizes = {(image.header.height, image.header.width) for image in images if isinstance(image, Encoded)}
+    if len(sizes) > 1:
+        raise _bad("encoded images of one request must have one size; send them apart")
+    return images, sizes.pop()
+
+
+def _base64(data: Any) -> list[bytes]:
+    if not isinstance(data, list) or not all(isinstance(item, str) for item in data):
+        raise _bad("data must be a list of encoded images in base64")
+    try:
+        return [base64.b64decode(item, validate=True) for item in data]
+    except (binascii.Error, ValueError) as error:
+        raise _bad("data is not base64") from error
+
+
+def _length_prefixed(data: bytes) -> list[bytes]:
+    files = []
+    position = 0
+    while position < len(data):
+        if position + 4 > len(data):
+            raise _bad("the binary data ends early")
+        (length,) = struct.unpack_from("<I", data, position)
+        position += 4
+        if position + length > len(data):
+            raise _bad("the binary data ends early")
+        files.append(data[position : position + length])
+        position += length
+    return files
+
+
+def _answer(name: str, query: _Query, perceptions: list[Perception]) -> Response:
+    """Write the response, with the binary tensors after the JSON."""
+    if len({perception.size for perception in perceptions}) > 1:
+        raise _bad("the images differ in size after their EXIF rotation; send them apart")
+    outputs: list[dict[str, Any]] = []
+    tail: list[bytes] = []
+    for output, binary in query.outputs.items():
+        array = _boxes(perceptions) if output == "boxes" else np.stack([_mask(p, output) for p in perceptions])
+        entry: dict[str, Any] = {
+            "name": output,
+            "datatype": "FP32" if output == "boxes" else "UINT8",
+            "shape": list(array.shape),
+        }
+        if binary:
+            tail.append(array.tobytes())
+            entry["parameters"] = {"binary_data_size": len(tail[-1])}
+        else:
+            entry["data"] = array.ravel().tolist()
+        outputs.append(entry)
+    mapping: dict[str, Any] = {"model_name": name, "model_version": _VERSION, "outputs": outputs}
+    if query.identifier is not None:
+        mapping["id"] = query.identifier
+    head = json.dumps(mapping, separators=(",", ":")).encode()
+    if not tail:
+        return Response(head, media_type="application/json")
+    return Response(
+        b"".join([head, *tail]), media_type="application/octet-stream", headers={_HEADER_LENGTH: str(len(head))}
+    )
+
+
+def _boxes(perceptions: Sequence[Perception]) -> NDArray[np.float32]:
+    rows = []
+    for perception in perceptions:
+        assert perception.boxes is not None
+        boxes = perception.boxes
+        rows.append(np.column_stack([boxes.xyxy, boxes.confidence, boxes.class_id.astype(np.float32)]))
+    array = np.full((len(rows), max(len(row) for row in rows), 6), -1, np.float32)
+    for index, row in enumerate(rows):
+        array[index, : len(row)] = row
+    return array
+
+
+def _mask(perception: Perception, name: str) -> NDArray[np.uint8]:
+    mask = getattr(perception, name)
+    return np.asarray(mask).view(np.uint8)
+
+
+def _bad(message: str) -> ProblemError:
+    return ProblemError(400, "bad_request", message)

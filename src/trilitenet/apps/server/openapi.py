@@ -1,0 +1,261 @@
+"""What the OpenAPI schema says of requests and answers, with examples. It describes; it does not run."""
+
+from __future__ import annotations
+
+from typing import Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = [
+    "ANY",
+    "INFER",
+    "METRICS",
+    "MODELS",
+    "PREDICT",
+    "PREDICT_BATCH",
+    "PROBE",
+    "BatchPrediction",
+    "ErrorAnswer",
+    "Prediction",
+]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Size(_Strict):
+    """Size of the image as it is shown, in pixels."""
+
+    height: int
+    width: int
+
+
+class Mask(_Strict):
+    """A mask as COCO compressed run-length encoding: column by column, first the run outside."""
+
+    size: tuple[int, int] = Field(description="height, width")
+    counts: str
+
+
+class Box(_Strict):
+    """One detected object."""
+
+    xyxy: tuple[float, float, float, float] = Field(description="left, top, right, bottom in pixels of the image")
+    confidence: float = Field(ge=0, le=1)
+    class_id: int
+    class_name: str
+
+
+class PerceptionForm(_Strict):
+    """What the network sees in one image. A task that the model lacks is null."""
+
+    schema_version: str = Field(alias="schema")
+    source: str | None = None
+    frame: int | None = None
+    timestamp: float | None = None
+    size: Size
+    class_names: list[str]
+    boxes: list[Box] | None = Field(description="Best first.")
+    drivable: Mask | None
+    lane: Mask | None
+
+
+class _Seen(_Strict):
+    status: Literal[200]
+    milliseconds: dict[str, float] = Field(description="Time in each stage.")
+    perception: PerceptionForm
+
+
+class Prediction(_Seen):
+    """The answer for one image."""
+
+    request_id: str
+    model: str
+
+
+class ErrorBody(_Strict):
+    """Why a request was refused."""
+
+    code: str = Field(description="A short word that programs can rely on.")
+    message: str = Field(description="One line for people.")
+    request_id: str
+
+
+class ErrorAnswer(_Strict):
+    """A refusal."""
+
+    error: ErrorBody
+
+
+class ErrorItem(_Strict):
+    """Why one image was refused."""
+
+    code: str
+    message: str
+
+
+class _Refused(_Strict):
+    status: int
+    error: ErrorItem
+
+
+class BatchPrediction(_Strict):
+    """The answer for several images, in their order; each has a status of its own."""
+
+    request_id: str
+    model: str
+    results: list[_Seen | _Refused]
+
+
+_PERCEPTION: Final = {
+    "schema": "1.0",
+    "source": None,
+    "frame": None,
+    "timestamp": None,
+    "size": {"height": 4, "width": 6},
+    "class_names": ["vehicle"],
+    "boxes": [{"xyxy": [1.25, 0.5, 4.0, 3.75], "confidence": 0.9132, "class_id": 0, "class_name": "vehicle"}],
+    "drivable": {"size": [4, 6], "counts": "b013"},
+    "lane": {"size": [4, 6], "counts": "h0"},
+}
+_SEEN: Final = {
+    "status": 200,
+    "milliseconds": {"decode": 6.1, "preprocess": 0.7, "queue": 0.1, "network": 10.4, "postprocess": 1.2},
+    "perception": _PERCEPTION,
+}
+_ABOUT: Final = {"request_id": "6f1c2f4b7d5e4a6b9f0e6d1c2b3a4958", "model": "small"}
+
+
+def _error(code: str, message: str) -> dict[str, Any]:
+    body = {"code": code, "message": message, "request_id": _ABOUT["request_id"]}
+    return {"model": ErrorAnswer, "content": {"application/json": {"example": {"error": body}}}}
+
+
+_REFUSALS: Final[dict[int | str, dict[str, Any]]] = {
+    400: _error("empty", "the image is empty"),
+    401: _error("unauthorized", "this service needs a bearer token"),
+    408: _error("upload_timeout", "the body did not arrive within 20 s"),
+    413: _error("too_many_pixels", "the image has 60000 x 60000 pixels; send a smaller one"),
+    415: _error("unsupported_type", "the bytes are not a JPEG, PNG or WebP image"),
+    422: _error("broken_image", "the JPEG image is broken or truncated"),
+    503: {
+        **_error("queue_full", "all 64 places are taken; try again in 1 s"),
+        "headers": {"Retry-After": {"description": "Seconds to wait.", "schema": {"type": "integer"}}},
+    },
+}
+_FILE: Final = {"type": "string", "format": "binary"}
+
+
+def _form(schema: dict[str, Any]) -> dict[str, Any]:
+    return {"multipart/form-data": {"schema": {"type": "object", "properties": schema}}}
+
+
+PREDICT: Final[dict[str, Any]] = {
+    "responses": {
+        200: {
+            "model": Prediction,
+            "description": "What the network sees, the image with it drawn, or the masks "
+            "(a palette PNG: 0 neither, 1 drivable, 2 lane marking, 3 both).",
+            "content": {
+                "application/json": {"example": {**_ABOUT, **_SEEN}},
+                "image/jpeg": {"schema": _FILE},
+                "image/png": {"schema": _FILE},
+            },
+        },
+        **_REFUSALS,
+    },
+    "openapi_extra": {
+        "requestBody": {
+            "required": True,
+            "description": "The image itself, or a form with the field image.",
+            "content": {
+                **_form({"image": _FILE}),
+                **{kind: {"schema": _FILE} for kind in ("image/jpeg", "image/png", "image/webp")},
+            },
+        }
+    },
+}
+
+PREDICT_BATCH: Final[dict[str, Any]] = {
+    "responses": {
+        200: {
+            "model": BatchPrediction,
+            "content": {
+                "application/json": {
+                    "example": {
+                        **_ABOUT,
+                        "results": [
+                            _SEEN,
+                            {"status": 422, "error": {"code": "broken_image", "message": "the PNG image is broken"}},
+                        ],
+                    }
+                }
+            },
+        },
+        **_REFUSALS,
+    },
+    "openapi_extra": {
+        "requestBody": {
+            "required": True,
+            "description": "A form with the field images, several times.",
+            "content": _form({"images": {"type": "array", "items": _FILE}}),
+        }
+    },
+}
+
+MODELS: Final[dict[str, Any]] = {
+    "responses": {
+        200: {
+            "description": "The model card: variant, classes, thresholds, training data, figures, licence.",
+            "content": {
+                "application/json": {
+                    "example": {
+                        "version": "0.1.0",
+                        "models": [
+                            {
+                                "name": "small",
+                                "backend": "openvino cpu",
+                                "ready": True,
+                                "card": {"variant": "small", "class_names": ["vehicle"]},
+                            }
+                        ],
+                    }
+                }
+            },
+        }
+    }
+}
+
+PROBE: Final[dict[str, Any]] = {
+    "responses": {
+        200: {"content": {"application/json": {"example": {"status": "ok"}}}},
+        503: {"description": "Not now.", "content": {"application/json": {"example": {"status": "unavailable"}}}},
+    }
+}
+
+METRICS: Final[dict[str, Any]] = {
+    "responses": {200: {"content": {"text/plain": {"example": "trilitenet_ready 1.0\n"}}}},
+}
+
+ANY: Final[dict[str, Any]] = {"responses": {200: {"content": {"application/json": {"schema": {"type": "object"}}}}}}
+
+INFER: Final[dict[str, Any]] = {
+    **ANY,
+    "openapi_extra": {
+        "requestBody": {
+            "required": True,
+            "content": {
+                "application/json": {
+                    "schema": {"type": "object"},
+                    "example": {
+                        "inputs": [
+                            {"name": "image", "datatype": "UINT8", "shape": [1, 1, 2, 3], "data": [0, 0, 0, 9, 9, 9]}
+                        ]
+                    },
+                },
+                "application/octet-stream": {"schema": _FILE},
+            },
+        }
+    },
+}

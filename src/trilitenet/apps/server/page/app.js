@@ -1,0 +1,307 @@
+// The page: wires the controls to what is seen. No library, no build step, no request but to this service.
+
+import { ServiceError, getModel, pause, predict, predictBatch, setToken } from "./client.js";
+import { drawFrame, prepare, shownBoxes } from "./draw.js";
+import { openCamera, openClip, openPhoto } from "./sources.js";
+
+const LAYERS = ["detection", "drivable", "lane"];
+const FLOOR = 0.05; // boxes below are not even asked for
+const CHUNK = 8; // frames of a clip in one request
+const STAGES = ["decode", "preprocess", "queue", "network", "postprocess"];
+
+const element = (id) => document.getElementById(id);
+const view = element("view");
+const options = Object.fromEntries(LAYERS.map((name) => [name, { show: true, opacity: 1 }]));
+options.confidence = 0.25;
+
+let frames = []; // { blob, result, picture?, time? }: pictures of a clip are decoded again when they are shown
+let current = null; // the prepared frame on the canvas
+let position = 0;
+let rate = 5;
+let fileName = "picture";
+let playing = false;
+let work = null; // AbortController of what runs now
+let retry = null; // what to do again once there is a token
+
+// ---------------------------------------------------------------------------------------------- showing
+
+function readControls() {
+  for (const name of LAYERS) {
+    const slider = element(`opacity-${name}`);
+    options[name] = { show: element(`show-${name}`).checked, opacity: slider.value / 100 };
+    slider.nextElementSibling.textContent = `${slider.value} %`;
+  }
+  options.confidence = Number(element("confidence").value);
+  element("confidence-text").textContent = options.confidence.toFixed(2);
+}
+
+function redraw(announce = true) {
+  readControls();
+  if (!current) return;
+  drawFrame(view, current, options);
+  const boxes = shownBoxes(current, options);
+  const text = describe(boxes);
+  view.setAttribute("aria-label", text);
+  element("summary").setAttribute("aria-live", announce ? "polite" : "off");
+  if (element("summary").textContent !== text) element("summary").textContent = text;
+  fillTable(
+    element("objects"),
+    boxes.map((box) => [box.class_name, box.confidence.toFixed(2), box.xyxy.map(Math.round).join(", ")]),
+  );
+  element("objects-count").textContent = ` (${boxes.length})`;
+}
+
+function describe(boxes) {
+  const parts = [];
+  if (current.boxes) {
+    const counts = new Map();
+    for (const box of boxes) counts.set(box.class_name, (counts.get(box.class_name) ?? 0) + 1);
+    const names = [...counts].map(([name, count]) => `${count} ${name}${count === 1 ? "" : "s"}`);
+    parts.push(names.length ? names.join(", ") : `no ${current.perception.class_names.join(" or ")}`);
+  }
+  const percent = (share) => `${(100 * share).toFixed(share < 0.1 ? 1 : 0)} %`;
+  if (current.drivable) parts.push(`drivable area ${percent(current.drivable.share)} of the picture`);
+  if (current.lane) parts.push(`lane markings ${percent(current.lane.share)}`);
+  return `${parts.join("; ")}.`;
+}
+
+function fillTable(body, rows) {
+  body.replaceChildren(
+    ...rows.map((cells) => {
+      const row = document.createElement("tr");
+      for (const cell of cells) row.insertCell().textContent = cell;
+      return row;
+    }),
+  );
+}
+
+async function showFrame(index, announce = true) {
+  position = index;
+  const frame = frames[index];
+  const picture = frame.picture ?? (await createImageBitmap(frame.blob));
+  if (position !== index) return; // another was asked for meanwhile
+  current = prepare(picture, frame.result.perception);
+  view.hidden = false;
+  element("empty").hidden = true;
+  element("save-overlay").disabled = element("save-json").disabled = false;
+  for (const name of LAYERS) {
+    const lacks = (name === "detection" ? current.boxes : current[name]) === null;
+    element(`show-${name}`).disabled = element(`opacity-${name}`).disabled = lacks;
+  }
+  element("seek").value = index;
+  element("seek-text").textContent = `${index + 1} / ${frames.length}`;
+  const { milliseconds, roundTrip } = frame.result;
+  element("timing-total").textContent = `: ${roundTrip.toFixed(0)} ms`;
+  const known = STAGES.filter((stage) => stage in milliseconds).map((stage) => [stage, milliseconds[stage].toFixed(1)]);
+  fillTable(element("timing"), [...known, [frames.length > 1 ? "round trip, a frame's share" : "round trip", roundTrip.toFixed(1)]]);
+  redraw(announce);
+}
+
+function showPlayer() {
+  const several = frames.length > 1;
+  element("player").hidden = !several;
+  element("save-clip").hidden = !several || !window.MediaRecorder || !view.captureStream;
+  element("seek").max = Math.max(0, frames.length - 1);
+}
+
+function showError(message) {
+  element("error").textContent = message;
+  element("error").hidden = !message;
+}
+
+// ---------------------------------------------------------------------------------------------- working
+
+/** Run a job; another one stops it. Errors are shown, and a missing token is asked for. */
+async function run(job) {
+  work?.abort();
+  playing = false;
+  element("play").textContent = "Play";
+  const mine = new AbortController();
+  work = mine;
+  showError("");
+  element("stop").hidden = false;
+  try {
+    await job(mine.signal);
+  } catch (error) {
+    if (error.name === "AbortError") return;
+    if (error instanceof ServiceError && error.status === 401) {
+      retry = job;
+      element("token-form").hidden = false;
+      element("token").focus();
+    } else {
+      showError(error.message);
+    }
+  } finally {
+    if (work === mine) {
+      work = null;
+      element("stop").hidden = true;
+      element("progress-row").hidden = true;
+      document.body.removeAttribute("aria-busy");
+    }
+  }
+}
+
+function openFile(file) {
+  if (!file) return;
+  fileName = file.name?.replace(/\.[^.]*$/, "") || "picture";
+  run((signal) => (file.type.startsWith("video/") ? seeClip(file, signal) : seePhoto(file, signal)));
+}
+
+async function seePhoto(file, signal) {
+  element("summary").textContent = "Looking …";
+  document.body.setAttribute("aria-busy", "true");
+  try {
+    const { blob, picture } = await openPhoto(file);
+    const result = await predict(blob, FLOOR, signal);
+    frames = [{ blob, result, picture: picture ?? (await createImageBitmap(blob)) }];
+    showPlayer();
+    await showFrame(0);
+  } catch (error) {
+    element("summary").textContent = "";
+    throw error;
+  }
+}
+
+async function seeClip(file, signal) {
+  frames = [];
+  rate = Number(element("rate").value);
+  const bar = element("progress");
+  element("progress-row").hidden = false;
+  bar.value = 0;
+  element("progress-text").textContent = "Opening the clip …";
+  let chunk = [];
+  for await (const frame of openClip(file, rate, signal)) {
+    chunk.push(frame);
+    if (chunk.length < CHUNK && frame.index < frame.count - 1) continue;
+    const results = await predictBatch(chunk.map((one) => one.blob), FLOOR, signal);
+    for (const [index, one] of chunk.entries()) {
+      one.picture.close();
+      frames.push({ blob: one.blob, time: one.time, result: results[index] });
+    }
+    chunk = [];
+    bar.value = frames.length / frame.count;
+    element("progress-text").textContent = `Frame ${frames.length} of ${frame.count}`;
+    showPlayer();
+    await showFrame(frames.length - 1, false);
+  }
+  await showFrame(0);
+}
+
+async function seeCamera(signal) {
+  fileName = "camera";
+  for await (const { blob, picture } of openCamera(signal)) {
+    const result = await predict(blob, FLOOR, signal);
+    frames[0]?.picture?.close?.();
+    frames = [{ blob, result, picture }];
+    showPlayer();
+    await showFrame(0, false);
+  }
+}
+
+// ---------------------------------------------------------------------------------------------- playing and saving
+
+async function play() {
+  playing = !playing;
+  element("play").textContent = playing ? "Pause" : "Play";
+  if (playing && position === frames.length - 1) await showFrame(0, false);
+  while (playing && position < frames.length - 1) {
+    await pause(1000 / rate);
+    if (playing) await showFrame(position + 1, false);
+  }
+  playing = false;
+  element("play").textContent = "Play";
+}
+
+function save(blob, suffix) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = `${fileName}${suffix}`;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+}
+
+function saveJson() {
+  const shown = frames.map(({ result, time }, index) => {
+    const { perception } = result;
+    const boxes = perception.boxes?.filter((box) => box.confidence >= options.confidence) ?? null;
+    const place = frames.length > 1 ? { frame: index, timestamp: time } : {};
+    return { ...perception, ...place, source: fileName, boxes };
+  });
+  const text = JSON.stringify(shown.length === 1 ? shown[0] : shown, null, 1);
+  save(new Blob([text], { type: "application/json" }), ".json");
+}
+
+async function saveClip() {
+  const button = element("save-clip");
+  button.disabled = true;
+  const recorder = new MediaRecorder(view.captureStream());
+  const pieces = [];
+  recorder.ondataavailable = (event) => pieces.push(event.data);
+  const stopped = new Promise((resolve) => {
+    recorder.onstop = resolve;
+  });
+  await showFrame(0, false);
+  recorder.start();
+  for (let index = 0; index < frames.length; index += 1) {
+    button.textContent = `Saving ${index + 1} / ${frames.length}`;
+    await showFrame(index, false);
+    await pause(1000 / rate);
+  }
+  recorder.stop();
+  await stopped;
+  save(new Blob(pieces, { type: "video/webm" }), ".webm");
+  button.textContent = "Save clip";
+  button.disabled = false;
+}
+
+// ---------------------------------------------------------------------------------------------- wiring
+
+for (const name of LAYERS) {
+  element(`show-${name}`).addEventListener("change", () => redraw(false));
+  element(`opacity-${name}`).addEventListener("input", () => redraw(false));
+}
+element("confidence").addEventListener("input", () => redraw());
+element("file").addEventListener("change", (event) => {
+  openFile(event.target.files[0]);
+  event.target.value = ""; // the same file may be chosen again
+});
+element("camera").addEventListener("click", () => run(seeCamera));
+element("stop").addEventListener("click", () => {
+  work?.abort();
+  element("camera").focus();
+});
+element("play").addEventListener("click", play);
+element("seek").addEventListener("input", (event) => {
+  playing = false;
+  showFrame(Number(event.target.value));
+});
+element("save-overlay").addEventListener("click", () => view.toBlob((blob) => save(blob, "-overlay.png"), "image/png"));
+element("save-json").addEventListener("click", saveJson);
+element("save-clip").addEventListener("click", saveClip);
+element("token-form").addEventListener("submit", (event) => {
+  event.preventDefault();
+  setToken(element("token").value.trim());
+  element("token").value = "";
+  element("token-form").hidden = true;
+  if (retry) run(retry);
+});
+document.addEventListener("dragover", (event) => {
+  event.preventDefault();
+  document.body.classList.add("over");
+});
+document.addEventListener("dragleave", (event) => {
+  if (!event.relatedTarget) document.body.classList.remove("over");
+});
+document.addEventListener("drop", (event) => {
+  event.preventDefault();
+  document.body.classList.remove("over");
+  openFile(event.dataTransfer.files[0]);
+});
+document.addEventListener("paste", (event) => openFile(event.clipboardData.files[0]));
+
+run(async () => {
+  const model = await getModel();
+  element("model").textContent = `${model.card.tasks.length === 3 ? "Vehicles, drivable area and lane markings" : model.card.tasks.join(", ")} · model ${model.name} on ${model.backend}`;
+  element("confidence").value = model.card.thresholds.confidence;
+  readControls();
+});

@@ -1,0 +1,86 @@
+// Talks to the service: one place for the token, for refusals and for waiting when the service is busy.
+
+let token = "";
+
+export function setToken(value) {
+  token = value;
+}
+
+/** A refusal of the service, or no answer at all. `status` is 0 when there was none. */
+export class ServiceError extends Error {
+  constructor(status, message) {
+    super(message);
+    this.status = status;
+  }
+}
+
+async function ask(path, options = {}) {
+  const headers = token ? { authorization: `Bearer ${token}` } : {};
+  let answer;
+  try {
+    answer = await fetch(path, { ...options, headers: { ...headers, ...options.headers } });
+  } catch (error) {
+    if (error.name === "AbortError") throw error;
+    throw new ServiceError(0, "The service does not answer. Is it still running?");
+  }
+  if (answer.ok) return answer.json();
+  let message = `The service answered ${answer.status}.`;
+  try {
+    message = (await answer.json()).error.message;
+  } catch {
+    // not one of the service's own answers: the status says it all
+  }
+  const error = new ServiceError(answer.status, message.charAt(0).toUpperCase() + message.slice(1));
+  error.wait = Number(answer.headers.get("retry-after")) || 1;
+  throw error;
+}
+
+async function patiently(path, options) {
+  for (let attempt = 0; ; attempt += 1) {
+    try {
+      return await ask(path, options);
+    } catch (error) {
+      if (error.status !== 503 || attempt === 4) throw error;
+      await pause(1000 * error.wait, options.signal);
+    }
+  }
+}
+
+export function pause(milliseconds, signal) {
+  return new Promise((resolve, reject) => {
+    const timer = setTimeout(resolve, milliseconds);
+    signal?.addEventListener("abort", () => {
+      clearTimeout(timer);
+      reject(new DOMException("stopped", "AbortError"));
+    });
+  });
+}
+
+export async function getModel() {
+  return (await ask("v1/models")).models[0];
+}
+
+/** See one picture (a Blob). All boxes come, also unsure ones: the slider chooses. */
+export async function predict(blob, floor, signal) {
+  const started = performance.now();
+  const result = await patiently(`v1/predict?confidence=${floor}`, {
+    method: "POST",
+    body: blob,
+    headers: { "content-type": blob.type || "application/octet-stream" },
+    signal,
+  });
+  return { ...result, roundTrip: performance.now() - started };
+}
+
+/** See several pictures in one request. */
+export async function predictBatch(blobs, floor, signal) {
+  const form = new FormData();
+  for (const blob of blobs) form.append("images", blob);
+  const started = performance.now();
+  const { results } = await patiently(`v1/predict/batch?confidence=${floor}`, { method: "POST", body: form, signal });
+  const roundTrip = (performance.now() - started) / blobs.length;
+  return results.map((result) => {
+    if (result.status !== 200) throw new ServiceError(result.status, result.error.message);
+    return { ...result, roundTrip };
+  });
+}

@@ -1,0 +1,101 @@
+// Where pictures come from: a file, a clip frame by frame, the camera. Each becomes JPEG bytes and an ImageBitmap.
+
+import { pause } from "./client.js";
+
+const LONGEST = { photo: 2560, clip: 1280, camera: 960 };
+const LARGEST_UPLOAD = 8 * 2 ** 20;
+const SENT_AS_IS = ["image/jpeg", "image/png", "image/webp"];
+const MOST_FRAMES = 300;
+
+/** Return { blob, picture } of a photo; the bytes are sent as they are unless they are huge or of another format. */
+export async function openPhoto(file) {
+  let picture;
+  try {
+    picture = await createImageBitmap(file);
+  } catch {
+    return { blob: file, picture: null }; // the service says what is wrong with it
+  }
+  const longest = Math.max(picture.width, picture.height);
+  if (SENT_AS_IS.includes(file.type) && longest <= LONGEST.photo && file.size <= LARGEST_UPLOAD) {
+    return { blob: file, picture };
+  }
+  return shrink(picture, picture.width, picture.height, LONGEST.photo, 0.92);
+}
+
+/** Draw a source no larger than `longest`, and return { blob, picture }. */
+async function shrink(source, width, height, longest, quality) {
+  const scale = Math.min(1, longest / Math.max(width, height));
+  const canvas = document.createElement("canvas");
+  canvas.width = Math.max(1, Math.round(width * scale));
+  canvas.height = Math.max(1, Math.round(height * scale));
+  canvas.getContext("2d").drawImage(source, 0, 0, canvas.width, canvas.height);
+  const blob = await new Promise((resolve) => canvas.toBlob(resolve, "image/jpeg", quality));
+  return { blob, picture: await createImageBitmap(canvas) };
+}
+
+function once(target, event, signal) {
+  return new Promise((resolve, reject) => {
+    target.addEventListener(event, resolve, { once: true, signal });
+    target.addEventListener("error", () => reject(new Error("This clip cannot be played here.")), { once: true, signal });
+    signal?.addEventListener("abort", () => reject(new DOMException("stopped", "AbortError")), { once: true });
+  });
+}
+
+/** Yield { blob, picture, index, count, time } for frames of a clip, `rate` a second. */
+export async function* openClip(file, rate, signal) {
+  const video = document.createElement("video");
+  video.muted = true;
+  video.playsInline = true;
+  video.preload = "auto";
+  const url = URL.createObjectURL(file);
+  try {
+    video.src = url;
+    await once(video, "loadeddata", signal);
+    if (!Number.isFinite(video.duration)) {
+      // A clip recorded by a browser tells its length only after a jump to its end.
+      video.currentTime = 1e9;
+      await once(video, "seeked", signal);
+    }
+    const count = Math.min(MOST_FRAMES, Math.max(1, Math.floor(video.duration * rate)));
+    for (let index = 0; index < count; index += 1) {
+      const time = index / rate;
+      const seeked = once(video, "seeked", signal);
+      video.currentTime = time + 1e-3;
+      await seeked;
+      const frame = await shrink(video, video.videoWidth, video.videoHeight, LONGEST.clip, 0.88);
+      yield { ...frame, index, count, time };
+    }
+  } finally {
+    video.removeAttribute("src");
+    video.load();
+    URL.revokeObjectURL(url);
+  }
+}
+
+/** Yield { blob, picture } from the camera, as fast as they are asked for. */
+export async function* openCamera(signal) {
+  if (!navigator.mediaDevices) throw new Error("The camera needs a secure page: https, or this machine itself.");
+  let stream;
+  try {
+    stream = await navigator.mediaDevices.getUserMedia({
+      video: { facingMode: "environment", width: { ideal: 1280 }, height: { ideal: 720 } },
+    });
+  } catch (error) {
+    const reasons = { NotAllowedError: "The camera was not allowed.", NotFoundError: "There is no camera." };
+    throw new Error(reasons[error.name] ?? `The camera cannot be used (${error.name}).`);
+  }
+  const video = document.createElement("video");
+  video.muted = true;
+  video.playsInline = true;
+  try {
+    video.srcObject = stream;
+    await video.play();
+    while (!signal.aborted) {
+      if (video.videoWidth) yield await shrink(video, video.videoWidth, video.videoHeight, LONGEST.camera, 0.85);
+      await pause(15, signal);
+    }
+  } finally {
+    for (const track of stream.getTracks()) track.stop();
+    video.srcObject = null;
+  }
+}

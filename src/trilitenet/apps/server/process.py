@@ -1,0 +1,207 @@
+"""The process: uvicorn with the timeouts it lacks, a shutdown that loses nothing, and logs in JSON."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import socket
+import sys
+import time
+from typing import Any, Final
+
+import uvicorn
+from uvicorn.config import Config
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.server import ServerState
+
+from trilitenet.apps.server.application import Application
+from trilitenet.apps.server.settings import Settings
+
+__all__ = ["GuardedProtocol", "GuardedServer", "JsonFormatter", "build_server", "set_up_logs"]
+
+_MAX_HEADERS: Final = 32 * 1024
+"""Bytes of a request's first line and headers."""
+
+_TCP_USER_TIMEOUT: Final = getattr(socket, "TCP_USER_TIMEOUT", None)
+
+
+class GuardedProtocol(HttpToolsProtocol):
+    """HTTP/1.1 with limits on what a slow or greedy client can hold.
+
+    uvicorn waits without end for a request's headers, takes headers of any length, and keeps a connection whose client
+    reads nothing. Here each has a limit.
+    """
+
+    limits = Settings()
+
+    def __init__(
+        self,
+        config: Config,
+        server_state: ServerState,
+        app_state: dict[str, Any],
+        _loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        super().__init__(config, server_state, app_state, _loop)
+        self._due: asyncio.TimerHandle | None = None
+        self._stuck: asyncio.TimerHandle | None = None
+        self._in_headers = True
+        self._header_bytes = 0
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Accept a connection, unless there are too many."""
+        super().connection_made(transport)
+        if len(self.connections) > self.limits.max_connections:
+            self._refuse(503, "too many connections", "retry-after: 1\r\n")
+            return
+        raw: socket.socket | None = transport.get_extra_info("socket")
+        if raw is not None and _TCP_USER_TIMEOUT is not None and raw.family in {socket.AF_INET, socket.AF_INET6}:
+            raw.setsockopt(socket.IPPROTO_TCP, _TCP_USER_TIMEOUT, int(self.limits.send_timeout * 1000))
+        self._wait_for_headers()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget a connection that is gone."""
+        self._cancel()
+        if self._stuck is not None:
+            self._stuck.cancel()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes; those of headers are counted."""
+        if self.transport.is_closing():
+            return
+        if self._in_headers:
+            self._header_bytes += len(data)
+        super().data_received(data)
+        if self._in_headers and self._due is None and (self.cycle is None or self.cycle.response_complete):
+            self._wait_for_headers()  # line breaks before a request begin no message, but end the idle time
+        if self._in_headers and self._header_bytes > _MAX_HEADERS and not self.transport.is_closing():
+            self._refuse(431, "the headers are too long")
+
+    def on_message_begin(self) -> None:
+        """A request begins: its headers are due."""
+        self._wait_for_headers()
+        super().on_message_begin()
+
+    def on_headers_complete(self) -> None:
+        """The headers are there: the body is due."""
+        self._cancel()
+        self._in_headers = False
+        # The application answers 408 in time; this only ends connections that trickle on after their answer.
+        self._due = self.loop.call_later(self.limits.upload_timeout + 5.0, self.transport.close)
+        super().on_headers_complete()
+
+    def on_message_complete(self) -> None:
+        """The request is there."""
+        self._cancel()
+        self._in_headers = True
+        self._header_bytes = 0
+        super().on_message_complete()
+
+    def pause_writing(self) -> None:
+        """The client does not read: it has so long to do so."""
+        super().pause_writing()
+        self._stuck = self.loop.call_later(self.limits.send_timeout, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        """The client reads again."""
+        if self._stuck is not None:
+            self._stuck.cancel()
+        super().resume_writing()
+
+    def _wait_for_headers(self) -> None:
+        self._cancel()
+        self._due = self.loop.call_later(self.limits.header_timeout, self._headers_late)
+
+    def _headers_late(self) -> None:
+        self._refuse(408, "the headers did not arrive in time")
+
+    def _cancel(self) -> None:
+        if self._due is not None:
+            self._due.cancel()
+            self._due = None
+
+    def _refuse(self, status: int, message: str, headers: str = "") -> None:
+        """Answer without the application, and close."""
+        body = json.dumps({"error": {"code": "connection", "message": message, "request_id": ""}})
+        if not self.transport.is_closing():
+            self.transport.write(
+                f"HTTP/1.1 {status} Refused\r\n{headers}content-type: application/json\r\n"
+                f"content-length: {len(body)}\r\nconnection: close\r\n\r\n{body}".encode()
+            )
+            self.transport.close()
+
+
+class GuardedServer(uvicorn.Server):
+    """Uvicorn's server with a shutdown in two steps.
+
+    First it says it is not ready and asks every client to close its connection after the next answer, and still serves;
+    only then does it stop to listen, and it ends when all that it accepted is answered.
+    """
+
+    def __init__(self, config: Config, application: Application) -> None:
+        super().__init__(config)
+        self._application = application
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Drain, then stop."""
+        service = self._application.service
+        service.draining = True
+        until = time.monotonic() + service.settings.drain
+        while time.monotonic() < until and not self.force_exit:
+            await asyncio.sleep(0.05)
+        await super().shutdown(sockets)
+
+
+def build_server(application: Application, host: str, port: int) -> GuardedServer:
+    """Build the server of a process.
+
+    Args:
+        application: What `create_app` made.
+        host: Address to listen on.
+        port: Port to listen on; 0 takes a free one.
+    """
+    settings = application.service.settings
+    protocol = type("Protocol", (GuardedProtocol,), {"limits": settings})
+    config = Config(
+        application,
+        host=host,
+        port=port,
+        http=protocol,
+        ws="none",
+        lifespan="on",
+        log_config=None,
+        access_log=False,
+        proxy_headers=False,
+        server_header=False,
+        backlog=1024,
+        timeout_keep_alive=int(settings.keep_alive),
+        timeout_graceful_shutdown=int(settings.shutdown_timeout),
+    )
+    return GuardedServer(config, application)
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object a line: time, level, logger, message, and the fields given as ``extra``."""
+
+    _known = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "color_message", "taskName"}
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Write one record."""
+        entry: dict[str, Any] = {
+            "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created)) + f".{int(record.msecs):03d}Z",
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        entry.update({key: value for key, value in record.__dict__.items() if key not in self._known})
+        if record.exc_info:
+            entry["exception"] = self.formatException(record.exc_info)
+        return json.dumps(entry, ensure_ascii=False, default=str)
+
+
+def set_up_logs(level: str = "INFO") -> None:
+    """Send all logs of the process to standard error, in JSON."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(JsonFormatter())
+    logging.basicConfig(level=level, handlers=[handler], force=True)

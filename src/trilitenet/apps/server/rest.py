@@ -1,0 +1,252 @@
+"""The service's own interface below ``/v1``, the probes and the metrics."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import functools
+import io
+import json
+from collections.abc import Callable, Coroutine
+from typing import Annotated, Any, Final, Literal, TypeVar
+
+import numpy as np
+from fastapi import APIRouter, Query, Request
+from numpy.typing import NDArray
+from PIL import Image
+from starlette.requests import ClientDisconnect
+from starlette.responses import JSONResponse, Response
+
+from trilitenet import __version__
+from trilitenet.apps.server import openapi
+from trilitenet.apps.server.intake import (
+    BYTES_PER_PIXEL,
+    Reservation,
+    check_header,
+    read_body,
+    read_header,
+)
+from trilitenet.apps.server.multipart import split_form
+from trilitenet.apps.server.problems import ProblemError
+from trilitenet.apps.server.service import Encoded, Outcome, Service
+from trilitenet.processing.drawing import DRIVABLE_COLOUR, LANE_COLOUR
+from trilitenet.structures import Perception
+
+__all__ = ["mask_image", "read_request", "rest_router", "until_vanished"]
+
+_T = TypeVar("_T")
+Format = Literal["json", "overlay", "masks"]
+Confidence = Annotated[
+    float | None, Query(ge=0.0, le=1.0, description="Keep boxes above this; the model's own threshold if left out.")
+]
+
+_PALETTE: Final = (0, 0, 0, *DRIVABLE_COLOUR, *LANE_COLOUR, 213, 94, 0)
+"""Colours of the values 0 to 3 of a mask image, so that it can be looked at."""
+
+
+def rest_router(service: Service) -> APIRouter:
+    """Return the routes of ``/v1``, ``/healthz``, ``/readyz`` and ``/metrics``."""
+    router = APIRouter()
+
+    @router.post("/v1/predict", tags=["prediction"], **openapi.PREDICT)
+    async def predict(
+        request: Request,
+        output: Annotated[Format, Query(alias="format", description="What to answer with.")] = "json",
+        confidence: Confidence = None,
+    ) -> Response:
+        """See one image: vehicles, drivable area and lane markings."""
+        with Reservation(service.memory) as reservation:
+            image = await _one_image(request, service, reservation)
+            finish = _finisher(output, request, service)
+            with service.admit(1) as deadline:
+                return await until_vanished(request, service.see(image, deadline, finish, confidence))
+
+    @router.post("/v1/predict/batch", tags=["prediction"], **openapi.PREDICT_BATCH)
+    async def predict_batch(request: Request, confidence: Confidence = None) -> Response:
+        """See several images. One that is broken does not spoil the others: each has a status of its own."""
+        with Reservation(service.memory) as reservation:
+            images = await _all_images(request, service, reservation)
+            finish = functools.partial(_to_mapping, service=service)
+            with service.admit(len(images)) as deadline:
+                jobs = [
+                    _settle(service.see(i, deadline, finish, confidence)) if isinstance(i, Encoded) else _as_is(i)
+                    for i in images
+                ]
+                results = await until_vanished(request, asyncio.gather(*jobs))
+            body = {**_about(request, service), "results": results}
+            return Response(await service.in_pool(_to_json, body), media_type="application/json")
+
+    @router.get("/v1/models", tags=["model"], **openapi.MODELS)
+    async def models() -> Response:
+        """Say which model is served, what it was trained on and how it may be used."""
+        card = dataclasses.asdict(service.card)
+        model = {"name": service.name, "backend": service.predictor.backend.name, "ready": service.ready, "card": card}
+        return JSONResponse({"version": __version__, "models": [model]})
+
+    @router.get("/healthz", tags=["operation"], **openapi.PROBE)
+    async def healthz() -> Response:
+        """Say whether the process does its work: 503 means that it should be restarted."""
+        return _probe(service.alive)
+
+    @router.get("/readyz", tags=["operation"], **openapi.PROBE)
+    async def readyz() -> Response:
+        """Say whether new requests are welcome: 503 while starting and while shutting down."""
+        return _probe(service.ready)
+
+    @router.get("/metrics", tags=["operation"], **openapi.METRICS)
+    async def metrics() -> Response:
+        """Return all counters in Prometheus' text format."""
+        return Response(service.metrics.text(), media_type="text/plain; version=0.0.4")
+
+    return router
+
+
+async def read_request(request: Request, service: Service, reservation: Reservation) -> bytes:
+    """Read a request's body within its limits.
+
+    Raises:
+        ProblemError: 499 if the client goes away meanwhile, or what `read_body` raises.
+    """
+    try:
+        return await read_body(request.stream(), reservation, service.settings)
+    except ClientDisconnect:
+        raise ProblemError(499, "vanished", "the client went away") from None
+
+
+async def until_vanished(request: Request, work: Coroutine[Any, Any, _T] | asyncio.Future[_T]) -> _T:
+    """Await work, and cancel it as soon as the client goes away.
+
+    Raises:
+        ProblemError: 499 if it does.
+    """
+    task = asyncio.ensure_future(work)
+    watcher = asyncio.ensure_future(_disconnected(request))
+    try:
+        await asyncio.wait({task, watcher}, return_when=asyncio.FIRST_COMPLETED)
+        if not task.done():
+            raise ProblemError(499, "vanished", "the client went away")
+        return task.result()
+    finally:
+        task.cancel()
+        watcher.cancel()
+
+
+async def _disconnected(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+async def _one_image(request: Request, service: Service, reservation: Reservation) -> Encoded:
+    images = await _encoded(request, service, reservation, most=1)
+    return _checked(images[0], service, reservation)
+
+
+async def _all_images(request: Request, service: Service, reservation: Reservation) -> list[Encoded | dict[str, Any]]:
+    """Return each image, or the result that says what is wrong with it."""
+    checked: list[Encoded | dict[str, Any]] = []
+    for data in await _encoded(request, service, reservation, most=service.settings.max_images):
+        try:
+            checked.append(_checked(data, service, reservation))
+        except ProblemError as problem:
+            if problem.status == 503:
+                raise
+            checked.append(_refusal(problem))
+    return checked
+
+
+def _checked(data: bytes, service: Service, reservation: Reservation) -> Encoded:
+    header = read_header(data)
+    check_header(header, service.settings)
+    reservation.take(header.width * header.height * BYTES_PER_PIXEL)
+    return Encoded(data, header)
+
+
+async def _encoded(request: Request, service: Service, reservation: Reservation, most: int) -> list[bytes]:
+    """Return the images of a request: the fields of a form that are called image or images, or the body itself."""
+    body = await read_request(request, service, reservation)
+    content_type = request.headers.get("content-type", "")
+    if not content_type.lower().startswith("multipart/"):
+        return [body]
+    reservation.take(len(body))  # the parts are copies
+    parts = await service.in_pool(split_form, body, content_type, most)
+    for part in parts:
+        if part.name not in {"image", "images"}:
+            raise ProblemError(400, "unknown_field", f"unknown form field {part.name[:40]!r}: call it image")
+    if not parts:
+        raise ProblemError(400, "empty", "the form holds no image")
+    return [part.data for part in parts]
+
+
+def _finisher(output: Format, request: Request, service: Service) -> Callable[[Outcome], Response]:
+    """Choose what makes the answer; it runs in a thread."""
+    about = _about(request, service)
+    if output == "json":
+        return lambda outcome: Response(
+            _to_json({**about, **_to_mapping(outcome, service)}),
+            media_type="application/json",
+            headers=_server_timing(outcome),
+        )
+    if output == "masks":
+        return lambda outcome: Response(
+            mask_image(outcome.perception), media_type="image/png", headers=_server_timing(outcome)
+        )
+    kind = "PNG" if "image/png" in request.headers.get("accept", "") else "JPEG"
+    return lambda outcome: Response(
+        _encode(outcome.perception.draw(outcome.image), kind),
+        media_type=f"image/{kind.lower()}",
+        headers=_server_timing(outcome),
+    )
+
+
+def _about(request: Request, service: Service) -> dict[str, Any]:
+    return {"request_id": request.scope["state"]["request_id"], "model": service.name}
+
+
+def _to_mapping(outcome: Outcome, service: Service) -> dict[str, Any]:
+    return {"status": 200, "milliseconds": outcome.milliseconds, "perception": outcome.perception.to_dict()}
+
+
+def _to_json(mapping: dict[str, Any]) -> bytes:
+    return json.dumps(mapping, ensure_ascii=False, separators=(",", ":")).encode()
+
+
+def _server_timing(outcome: Outcome) -> dict[str, str]:
+    return {"server-timing": ", ".join(f"{stage};dur={value}" for stage, value in outcome.milliseconds.items())}
+
+
+def mask_image(perception: Perception) -> bytes:
+    """Return both masks as one PNG with a palette: 0 neither, 1 drivable, 2 lane marking, 3 both."""
+    values = np.zeros(perception.size, np.uint8)
+    for value, mask in ((1, perception.drivable), (2, perception.lane)):
+        if mask is not None:
+            values += mask.astype(np.uint8) * np.uint8(value)
+    image = Image.fromarray(values)
+    image.putpalette(_PALETTE)
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG", compress_level=1)
+    return buffer.getvalue()
+
+
+def _encode(pixels: NDArray[np.uint8], kind: str) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, kind, quality=90, compress_level=1)
+    return buffer.getvalue()
+
+
+async def _settle(work: Coroutine[Any, Any, dict[str, Any]]) -> dict[str, Any]:
+    try:
+        return await work
+    except ProblemError as problem:
+        return _refusal(problem)
+
+
+async def _as_is(result: dict[str, Any]) -> dict[str, Any]:
+    return result
+
+
+def _refusal(problem: ProblemError) -> dict[str, Any]:
+    return {"status": problem.status, "error": {"code": problem.code, "message": problem.message}}
+
+
+def _probe(good: bool) -> Response:
+    return JSONResponse({"status": "ok" if good else "unavailable"}, status_code=200 if good else 503)

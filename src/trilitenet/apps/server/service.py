@@ -1,0 +1,228 @@
+"""The way of one image through the service: accepted, decoded, letterboxed, batched, post-processed, answered.
+
+Decoding and answering run in two small thread pools and the network in the batcher's thread, so the event loop only
+passes messages and a slow client holds nothing but its own connection.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import functools
+import logging
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet import __version__
+from trilitenet.apps.server.batching import Admission, Batcher
+from trilitenet.apps.server.intake import Header, MemoryBudget, decode
+from trilitenet.apps.server.metrics import Metrics
+from trilitenet.apps.server.problems import BusyError
+from trilitenet.apps.server.settings import Settings
+from trilitenet.inference.predictor import Predictor
+from trilitenet.processing.letterbox import Letterbox
+from trilitenet.structures import Perception, RawOutputs
+
+__all__ = ["Encoded", "Outcome", "Service"]
+
+logger = logging.getLogger(__name__)
+_T = TypeVar("_T")
+
+
+@dataclasses.dataclass(frozen=True)
+class Encoded:
+    """The bytes of an image whose header was checked."""
+
+    data: bytes
+    header: Header
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What came of one image.
+
+    Attributes:
+        perception: In pixels of the image.
+        image: (height, width, 3) uint8 RGB.
+        milliseconds: By stage.
+    """
+
+    perception: Perception
+    image: NDArray[np.uint8]
+    milliseconds: dict[str, float]
+
+
+class Service:
+    """A predictor behind a bounded queue.
+
+    Args:
+        predictor: Its stages are run apart from each other.
+        name: What clients call the model.
+        settings: Limits.
+    """
+
+    def __init__(self, predictor: Predictor, name: str, settings: Settings) -> None:
+        self.predictor = predictor
+        self.name = name
+        self.settings = settings
+        self.card = predictor.card
+        self.metrics = Metrics()
+        self.memory = MemoryBudget(settings.memory)
+        self.admission = Admission(settings.queue)
+        self.draining = False
+        self._warm = False
+        self._batcher = Batcher(
+            predictor.backend.run,
+            max_batch=settings.max_batch,
+            delay=settings.batch_delay,
+            observe=self._observe_batch,
+        )
+        self._intake = ThreadPoolExecutor(settings.thread_count, "trilitenet-intake")
+        self._outcome = ThreadPoolExecutor(settings.thread_count, "trilitenet-outcome")
+        self.metrics.model(name, predictor.backend.name, __version__)
+        self.metrics.gauge("queue_length", "Images that wait for the network.", lambda: self._batcher.length)
+        self.metrics.gauge("accepted", "Images accepted and not yet answered.", lambda: self.admission.taken)
+        self.metrics.gauge("memory_bytes", "Memory that requests in work hold.", lambda: self.memory.used)
+        self.metrics.gauge("ready", "1 when new requests are welcome.", lambda: float(self.ready))
+
+    @property
+    def ready(self) -> bool:
+        """Whether new requests are welcome."""
+        return self._warm and not self.draining and self._batcher.alive
+
+    @property
+    def alive(self) -> bool:
+        """Whether the service can still do its work, now or once it is ready."""
+        return not self._warm or self._batcher.alive
+
+    async def start(self) -> None:
+        """Start the threads and run the network once, so that the first request is not slow."""
+        self._batcher.start()
+        height, width = self.card.input_size
+        canvas, _ = self.predictor.preprocess(np.full((height, width, 3), 114, np.uint8))
+        await asyncio.wrap_future(self._batcher.submit(canvas, deadline=float("inf")))
+        self._warm = True
+
+    async def stop(self) -> None:
+        """Finish what was accepted, then end the threads."""
+        self.draining = True
+        await asyncio.to_thread(self._batcher.close, self.settings.shutdown_timeout)
+        self._intake.shutdown(wait=True, cancel_futures=True)
+        self._outcome.shutdown(wait=True, cancel_futures=True)
+
+    @contextmanager
+    def admit(self, count: int) -> Iterator[float]:
+        """Accept ``count`` images, until the end of the block.
+
+        Yields:
+            The time, on `time.monotonic`, by which they must be answered.
+
+        Raises:
+            BusyError: If there is no room for all of them.
+        """
+        self.admission.enter(count)
+        try:
+            yield time.monotonic() + self.settings.deadline
+        finally:
+            self.admission.leave(count)
+
+    async def in_pool(self, function: Callable[..., _T], *arguments: Any) -> _T:
+        """Run something slow that comes before the network, off the event loop."""
+        return await asyncio.get_running_loop().run_in_executor(self._intake, function, *arguments)
+
+    async def see(
+        self,
+        image: Encoded | NDArray[np.uint8],
+        deadline: float,
+        finish: Callable[[Outcome], _T],
+        confidence: float | None = None,
+    ) -> _T:
+        """Take an admitted image through all stages.
+
+        Args:
+            image: Its bytes, or (height, width, 3) uint8 RGB.
+            deadline: What `admit` gave.
+            finish: Makes the answer of the outcome, in a thread.
+            confidence: Replaces the model's threshold for boxes.
+
+        Raises:
+            BusyError: If it is not through by the deadline.
+            ProblemError: If the image is broken.
+        """
+        predictor = self.predictor
+        if confidence is not None:
+            thresholds = dataclasses.replace(predictor.thresholds, confidence=confidence)
+            predictor = Predictor(predictor.backend, thresholds, long_side=predictor.long_side)
+        try:
+            return await asyncio.wait_for(
+                self._stages(image, deadline, finish, predictor), timeout=deadline - time.monotonic()
+            )
+        except asyncio.TimeoutError:
+            raise _too_late() from None
+
+    async def _stages(
+        self,
+        image: Encoded | NDArray[np.uint8],
+        deadline: float,
+        finish: Callable[[Outcome], _T],
+        predictor: Predictor,
+    ) -> _T:
+        loop = asyncio.get_running_loop()
+        pixels, canvas, letterbox, milliseconds = await self.in_pool(self._prepare, image, deadline)
+        raw, waited, ran = await asyncio.wrap_future(self._batcher.submit(canvas, deadline))
+        self._note(milliseconds, "queue", waited)
+        self._note(milliseconds, "network", ran)
+        call = functools.partial(self._answer, raw, letterbox, pixels, milliseconds, predictor, finish)
+        return await loop.run_in_executor(self._outcome, call)
+
+    def _prepare(
+        self, image: Encoded | NDArray[np.uint8], deadline: float
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Letterbox, dict[str, float]]:
+        start = time.monotonic()
+        if start > deadline:
+            raise _too_late()
+        milliseconds: dict[str, float] = {}
+        if isinstance(image, Encoded):
+            pixels = decode(image.data, image.header)
+            self._note(milliseconds, "decode", time.monotonic() - start)
+        else:
+            pixels = image
+        start = time.monotonic()
+        canvas, letterbox = self.predictor.preprocess(pixels)
+        self._note(milliseconds, "preprocess", time.monotonic() - start)
+        return pixels, canvas, letterbox, milliseconds
+
+    def _answer(
+        self,
+        raw: RawOutputs,
+        letterbox: Letterbox,
+        pixels: NDArray[np.uint8],
+        milliseconds: dict[str, float],
+        predictor: Predictor,
+        finish: Callable[[Outcome], _T],
+    ) -> _T:
+        start = time.monotonic()
+        (perception,) = predictor.postprocess(raw, [letterbox])
+        self._note(milliseconds, "postprocess", time.monotonic() - start)
+        start = time.monotonic()
+        answer = finish(Outcome(perception, pixels, milliseconds))
+        self.metrics.stage("encode", time.monotonic() - start)
+        return answer
+
+    def _note(self, milliseconds: dict[str, float], stage: str, seconds: float) -> None:
+        milliseconds[stage] = round(seconds * 1e3, 3)
+        self.metrics.stage(stage, seconds)
+
+    def _observe_batch(self, size: int, seconds: float) -> None:
+        self.metrics.batch(size)
+        self.admission.observe(seconds / size)
+
+
+def _too_late() -> BusyError:
+    return BusyError("deadline", "the image waited too long; try again soon")

@@ -1,0 +1,162 @@
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import CancelledError
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from trilitenet.apps.server.batching import Admission, Batcher, split
+from trilitenet.apps.server.problems import BusyError
+from trilitenet.structures import RawOutputs
+
+LATER = float("inf")
+
+
+class Network:
+    """Answers with the first byte of each canvas, and waits for the gate before it does."""
+
+    def __init__(self) -> None:
+        self.gate = threading.Event()
+        self.started = threading.Semaphore(0)
+        self.batches: list[list[int]] = []
+        self.error: Exception | None = None
+
+    def __call__(self, batch: NDArray[np.uint8]) -> RawOutputs:
+        self.started.release()
+        assert self.gate.wait(10)
+        self.batches.append([int(canvas[0, 0, 0]) for canvas in batch])
+        if self.error is not None:
+            raise self.error
+        return RawOutputs(None, batch[..., 0].copy(), None)
+
+
+@pytest.fixture
+def network() -> Network:
+    return Network()
+
+
+@pytest.fixture
+def batcher(network: Network) -> Iterator[Batcher]:
+    batcher = Batcher(network, max_batch=3)
+    batcher.start()
+    yield batcher
+    network.gate.set()
+    batcher.close(10)
+    assert not batcher.alive
+
+
+def canvas(value: int, size: int = 4) -> NDArray[np.uint8]:
+    return np.full((size, size, 3), value, np.uint8)
+
+
+def value(result: tuple[RawOutputs, float, float]) -> int:
+    assert result[0].drivable is not None
+    return int(result[0].drivable[0, 0, 0])
+
+
+def test_what_gathers_while_the_network_runs_is_one_batch(network: Network, batcher: Batcher) -> None:
+    first = batcher.submit(canvas(0), LATER)
+    assert network.started.acquire(timeout=5)
+    others = [batcher.submit(canvas(i), LATER) for i in range(1, 6)]
+    assert batcher.length == 5
+    network.gate.set()
+    assert [value(future.result(5)) for future in [first, *others]] == [0, 1, 2, 3, 4, 5]
+    assert network.batches == [[0], [1, 2, 3], [4, 5]]
+
+
+def test_shapes_do_not_mix_and_the_oldest_goes_first(network: Network, batcher: Batcher) -> None:
+    batcher.submit(canvas(0), LATER)
+    assert network.started.acquire(timeout=5)
+    sizes = [(1, 8), (2, 4), (3, 8), (4, 4)]
+    futures = [batcher.submit(canvas(i, size), LATER) for i, size in sizes]
+    network.gate.set()
+    assert [value(future.result(5)) for future in futures] == [1, 2, 3, 4]
+    assert network.batches == [[0], [1, 3], [2, 4]]
+
+
+def test_the_cancelled_and_the_late_are_left_out(network: Network, batcher: Batcher) -> None:
+    batcher.submit(canvas(0), LATER)
+    assert network.started.acquire(timeout=5)
+    gone = batcher.submit(canvas(1), LATER)
+    late = batcher.submit(canvas(2), time.monotonic() - 1)
+    good = batcher.submit(canvas(3), LATER)
+    assert gone.cancel()
+    network.gate.set()
+    assert value(good.result(5)) == 3
+    with pytest.raises(BusyError, match="too long"):
+        late.result(5)
+    with pytest.raises(CancelledError):
+        gone.result(5)
+    assert network.batches == [[0], [3]]
+
+
+def test_a_failing_batch_fails_alone(network: Network, batcher: Batcher) -> None:
+    network.gate.set()
+    network.error = RuntimeError("no")
+    with pytest.raises(RuntimeError, match="no"):
+        batcher.submit(canvas(0), LATER).result(5)
+    network.error = None
+    assert value(batcher.submit(canvas(1), LATER).result(5)) == 1
+
+
+def test_closing_finishes_what_waits_and_takes_no_more(network: Network) -> None:
+    batcher = Batcher(network, max_batch=1)
+    batcher.start()
+    futures = [batcher.submit(canvas(i), LATER) for i in range(4)]
+    threading.Timer(0.05, network.gate.set).start()
+    batcher.close(10)
+    assert [value(future.result(0)) for future in futures] == [0, 1, 2, 3]
+    with pytest.raises(BusyError, match="closing"):
+        batcher.submit(canvas(9), LATER)
+
+
+def test_a_delay_waits_for_company(network: Network) -> None:
+    sizes: list[tuple[int, float]] = []
+    batcher = Batcher(network, max_batch=2, delay=5.0, observe=lambda size, seconds: sizes.append((size, seconds)))
+    network.gate.set()
+    batcher.start()
+    futures = [batcher.submit(canvas(i), LATER) for i in range(2)]
+    for future in futures:
+        future.result(2)
+    batcher.close(10)
+    assert network.batches == [[0, 1]]
+    assert [size for size, _ in sizes] == [2]
+
+
+def test_admission_counts_and_tells_how_long_to_wait() -> None:
+    admission = Admission(4)
+    admission.enter(3)
+    with pytest.raises(BusyError):
+        admission.enter(2)
+    admission.enter(1)
+    for _ in range(100):
+        admission.observe(2.0)
+    with pytest.raises(BusyError) as caught:
+        admission.enter()
+    assert int(caught.value.headers["retry-after"]) == 8
+    admission.leave(4)
+    assert admission.taken == 0
+
+
+@pytest.mark.parametrize("missing", ["detection", "drivable", "lane"])
+def test_split_gives_views_and_keeps_what_is_missing(missing: str) -> None:
+    outputs: dict[str, Any] = {
+        "detection": np.arange(24, dtype=np.float32).reshape(2, 2, 6),
+        "drivable": np.arange(8, dtype=np.uint8).reshape(2, 2, 2),
+        "lane": np.arange(8, dtype=np.uint8).reshape(2, 2, 2),
+    }
+    outputs[missing] = None
+    pieces = split(RawOutputs(**outputs), 2)
+    for name, whole in outputs.items():
+        for index, piece in enumerate(pieces):
+            part = getattr(piece, name)
+            if whole is None:
+                assert part is None
+            else:
+                np.testing.assert_array_equal(part, whole[index : index + 1])
+                assert part.base is not None

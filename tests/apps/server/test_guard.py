@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from tests.apps.server.conftest import TOKEN, FakeBackend, MakeApp
+from trilitenet.apps.server.application import Application
+
+
+@pytest.mark.parametrize("path", ["/", "/healthz", "/v1/models", "/nowhere", "/metrics"])
+def test_every_answer_has_the_security_headers(client: TestClient, path: str) -> None:
+    headers = client.get(path).headers
+    assert headers["x-content-type-options"] == "nosniff"
+    assert headers["x-frame-options"] == "DENY"
+    assert headers["referrer-policy"] == "no-referrer"
+    assert "default-src 'none'" in headers["content-security-policy"]
+    assert "frame-ancestors 'none'" in headers["content-security-policy"]
+    assert "access-control-allow-origin" not in headers
+    assert "server" not in headers
+
+
+def test_there_is_no_cors(client: TestClient, jpeg: bytes) -> None:
+    preflight = client.options(
+        "/v1/predict", headers={"origin": "https://example.org", "access-control-request-method": "POST"}
+    )
+    assert preflight.status_code == 405
+    answer = client.post("/v1/predict", content=jpeg, headers={"origin": "https://example.org"})
+    assert "access-control-allow-origin" not in answer.headers
+
+
+@pytest.mark.parametrize("given", ["abc-123", "A" * 64])
+def test_a_good_request_id_is_kept(client: TestClient, given: str) -> None:
+    assert client.get("/healthz", headers={"x-request-id": given}).headers["x-request-id"] == given
+
+
+@pytest.mark.parametrize("given", ["", "A" * 65, "a b", 'x"y', "<script>"])
+def test_a_bad_request_id_is_replaced(client: TestClient, given: str) -> None:
+    answer = client.get("/healthz", headers={"x-request-id": given}).headers["x-request-id"]
+    assert answer != given
+    assert len(answer) == 32
+
+
+class TestToken:
+    @pytest.fixture
+    def client(self, make_app: MakeApp) -> Any:
+        with TestClient(make_app(token=TOKEN)) as client:
+            yield client
+
+    @pytest.mark.parametrize("path", ["/v1/models", "/metrics", "/openapi.json", "/v2", "/nowhere"])
+    @pytest.mark.parametrize(
+        "header",
+        [None, "", "Bearer", f"Bearer {TOKEN}x", f"Bearer {TOKEN[:-1]}", f"Basic {TOKEN}", TOKEN],
+    )
+    def test_without_the_token_there_is_nothing(self, client: TestClient, path: str, header: str | None) -> None:
+        headers = {} if header is None else {"authorization": header}
+        answer = client.get(path, headers=headers)
+        assert answer.status_code == 401
+        assert answer.headers["www-authenticate"] == "Bearer"
+
+    @pytest.mark.parametrize("scheme", ["Bearer", "bearer"])
+    def test_with_it_there_is_everything(self, client: TestClient, scheme: str) -> None:
+        assert client.get("/v1/models", headers={"authorization": f"{scheme} {TOKEN}"}).status_code == 200
+
+    @pytest.mark.parametrize("path", ["/", "/app.js", "/app.css", "/icon.svg", "/healthz", "/readyz"])
+    def test_page_and_probes_need_none(self, client: TestClient, path: str) -> None:
+        assert client.get(path).status_code == 200
+
+
+def test_a_declared_length_is_refused_before_the_body(app: Application) -> None:
+    sent = _call(app, [(b"content-length", b"4294967296")], [])
+    assert sent[0]["status"] == 413
+
+
+@pytest.mark.parametrize("length", [b"x", b"-1", b"1e9"])
+def test_a_length_must_be_a_number(app: Application, length: bytes) -> None:
+    assert _call(app, [(b"content-length", length)], [])[0]["status"] == 400
+
+
+def test_an_undeclared_body_is_cut_off_at_the_limit(make_app: MakeApp) -> None:
+    app = make_app(max_body=1000)
+    pieces = [{"type": "http.request", "body": b"x" * 400, "more_body": True}] * 10
+    sent = _call(app, [(b"transfer-encoding", b"chunked")], pieces)
+    assert sent[0]["status"] == 413
+    assert (b"connection", b"close") in sent[0]["headers"]
+    assert app.service.memory.used == 0
+
+
+def test_a_body_that_does_not_arrive_times_out(make_app: MakeApp) -> None:
+    app = make_app(upload_timeout=0.1)
+    sent = _call(app, [(b"content-length", b"100")], [{"type": "http.request", "body": b"x", "more_body": True}])
+    assert sent[0]["status"] == 408
+    assert app.service.memory.used == 0
+
+
+def test_a_client_that_vanishes_while_sending_holds_nothing(app: Application) -> None:
+    sent = _call(app, [(b"content-length", b"100")], [{"type": "http.disconnect"}])
+    assert sent[0]["status"] == 499
+    assert app.service.memory.used == app.service.admission.taken == 0
+    assert "trilitenet_vanished_total 1.0" in app.service.metrics.text().decode()
+
+
+def test_a_client_that_vanishes_while_waiting_leaves_the_queue(
+    app: Application, backend: FakeBackend, jpeg: bytes
+) -> None:
+    pieces: list[dict[str, Any]] = [
+        {"type": "http.request", "body": jpeg, "more_body": False},
+        {"type": "http.disconnect"},
+    ]
+    backend.gate.set()
+
+    async def run() -> None:
+        await app.service.start()
+        backend.gate.clear()
+        sent = await _request(app, [(b"content-length", b"%d" % len(jpeg))], pieces)
+        assert sent[0]["status"] == 499
+        assert app.service.memory.used == app.service.admission.taken == 0
+        backend.gate.set()
+        await app.service.stop()
+
+    asyncio.run(run())
+
+
+def test_the_log_names_requests_and_nothing_of_their_content(
+    client: TestClient, jpeg: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO, logger="trilitenet.server"):
+        client.post("/v1/predict?token=secret", files={"image": ("secret.jpg", jpeg)}, headers={"x-request-id": "one"})
+        client.post("/v1/predict", content=b"secret")
+    first, second = [record for record in caplog.records if record.message == "request"]
+    fields = {"request_id": "one", "method": "POST", "route": "/v1/predict", "status": 200}
+    assert fields.items() <= first.__dict__.items()
+    assert second.__dict__["problem"] == "unsupported_type"
+    assert "secret" not in repr([record.__dict__ for record in caplog.records])
+
+
+def _call(app: Application, headers: list[tuple[bytes, bytes]], pieces: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return asyncio.run(_request(app, headers, pieces))
+
+
+async def _request(
+    app: Application, headers: list[tuple[bytes, bytes]], pieces: list[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Send one request piece by piece; after the last, the client is silent."""
+    left = list(pieces)
+    sent: list[dict[str, Any]] = []
+
+    async def receive() -> dict[str, Any]:
+        if not left:
+            await asyncio.sleep(30)
+        return left.pop(0)
+
+    async def send(message: Any) -> None:
+        sent.append(dict(message))
+
+    scope = {
+        "type": "http",
+        "asgi": {"version": "3.0"},
+        "http_version": "1.1",
+        "method": "POST",
+        "scheme": "http",
+        "path": "/v1/predict",
+        "raw_path": b"/v1/predict",
+        "root_path": "",
+        "query_string": b"",
+        "headers": headers,
+        "client": ("127.0.0.1", 1),
+        "server": ("127.0.0.1", 2),
+        "state": {},
+    }
+    await app(scope, receive, send)
+    return sent

@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from tests.apps.server.conftest import MakeApp, Running, encode, picture
+from trilitenet.apps.server.application import Application
+
+
+def test_tritons_client_gets_right_answers(app: Application, run_app: Callable[[Application], Running]) -> None:
+    triton = pytest.importorskip("tritonclient.http", reason="tritonclient is not installed")
+    running = run_app(app)
+    client = triton.InferenceServerClient(f"127.0.0.1:{running.port}", concurrency=2)
+    try:
+        assert client.is_server_live()
+        assert client.is_server_ready()
+        assert client.is_model_ready("tiny")
+        assert client.get_server_metadata()["name"] == "trilitenet"
+        metadata = client.get_model_metadata("tiny", "1")
+        assert [output["name"] for output in metadata["outputs"]] == ["boxes", "drivable", "lane"]
+        pixels = np.stack([picture(80, 60), picture(80, 60)[:, ::-1]])
+        expected = [app.service.predictor(image) for image in pixels]
+        for binary in (True, False):
+            tensor = triton.InferInput("image", list(pixels.shape), "UINT8")
+            tensor.set_data_from_numpy(np.ascontiguousarray(pixels), binary_data=binary)
+            outputs = [triton.InferRequestedOutput(name, binary_data=binary) for name in ("boxes", "drivable", "lane")]
+            result = client.infer("tiny", [tensor], outputs=outputs, request_id="seven")
+            assert result.get_response()["id"] == "seven"
+            for index, seen in enumerate(expected):
+                assert seen.boxes is not None
+                np.testing.assert_array_equal(result.as_numpy("boxes")[index, :, :4], seen.boxes.xyxy)
+                np.testing.assert_array_equal(result.as_numpy("boxes")[index, :, 4], seen.boxes.confidence)
+                np.testing.assert_array_equal(result.as_numpy("drivable")[index], seen.drivable)
+                np.testing.assert_array_equal(result.as_numpy("lane")[index], seen.lane)
+        # Encoded images in BYTES, and the default outputs.
+        file = encode(picture(80, 60), "PNG")
+        tensor = triton.InferInput("image", [1], "BYTES")
+        tensor.set_data_from_numpy(np.array([file], dtype=np.object_))
+        result = client.infer("tiny", [tensor])
+        np.testing.assert_array_equal(result.as_numpy("lane")[0], expected[0].lane)
+        with pytest.raises(triton.InferenceServerException, match="there is no model 'other'"):
+            client.infer("other", [tensor])
+        job = client.async_infer("tiny", [tensor])
+        np.testing.assert_array_equal(job.get_result().as_numpy("drivable")[0], expected[0].drivable)
+    finally:
+        client.close()
+
+
+def _tensor(**changes: Any) -> dict[str, Any]:
+    tensor = {"name": "image", "datatype": "UINT8", "shape": [1, 2, 2, 3], "data": [7] * 12}
+    return {"inputs": [{**tensor, **changes}]}
+
+
+def test_plain_json_works(client: TestClient) -> None:
+    answer = client.post("/v2/models/tiny/infer", json={**_tensor(), "outputs": [{"name": "lane"}]})
+    (output,) = answer.json()["outputs"]
+    assert output == {"name": "lane", "datatype": "UINT8", "shape": [1, 2, 2], "data": [0, 0, 0, 0]}
+    nested = client.post("/v2/models/tiny/infer", json=_tensor(data=np.full((1, 2, 2, 3), 7).tolist()))
+    assert len(nested.json()["outputs"]) == 3
+    text = base64.b64encode(encode(picture(32, 32))).decode()
+    files = client.post("/v2/models/tiny/infer", json=_tensor(datatype="BYTES", shape=[1], data=[text]))
+    assert files.json()["outputs"][1]["shape"] == [1, 32, 32]
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "message"),
+    [
+        ("not json", 400, "not JSON"),
+        ("[" * 100_000, 400, "not JSON"),
+        ("[]", 400, "not a JSON object"),
+        ("{}", 400, "inputs must hold one"),
+        (_tensor(name="x"), 400, "unknown input 'x'"),
+        (_tensor(shape=[1, 2, 2]), 400, "must be"),
+        (_tensor(shape=[1, 2, 2, -3]), 400, "positive"),
+        (_tensor(shape=[1, 2, 2, True]), 400, "positive"),
+        (_tensor(shape=[2, 2, 2, 3]), 400, "fill"),
+        (_tensor(shape=[999, 2, 2, 3]), 413, "at most"),
+        (_tensor(shape=[1, 99999, 99999, 3]), 413, "pixels"),
+        (_tensor(data=[256] * 12), 400, "0 to 255"),
+        (_tensor(data=["a"] * 12), 400, "0 to 255"),
+        (_tensor(data=[0.5] * 12), 400, "0 to 255"),
+        (_tensor(data=[[1], [2, 3]]), 400, "fill"),
+        (_tensor(data=None), 400, "0 to 255"),
+        (_tensor(datatype="FP32"), 400, "datatype"),
+        (_tensor(datatype="BYTES", shape=[1], data=["%%%"]), 400, "base64"),
+        (_tensor(datatype="BYTES", shape=[1], data=["aGVsbG8="]), 415, "not a JPEG"),
+        (_tensor(parameters={"binary_data_size": 3}), 400, "3, 0 bytes came"),
+        ({**_tensor(), "outputs": [{"name": "x"}]}, 400, "unknown output 'x'"),
+        ({**_tensor(), "id": 3}, 400, "id must be"),
+    ],
+)
+def test_malformed_requests_are_refused(client: TestClient, body: Any, status: int, message: str) -> None:
+    content = body if isinstance(body, str) else json.dumps(body)
+    answer = client.post("/v2/models/tiny/infer", content=content)
+    assert answer.status_code == status
+    assert message in answer.json()["error"]
+
+
+@pytest.mark.parametrize("length", ["5", "x", "-1"])
+def test_a_wrong_header_length_is_refused(client: TestClient, length: str) -> None:
+    answer = client.post("/v2/models/tiny/infer", content="{}", headers={"inference-header-content-length": length})
+    assert answer.status_code == 400
+
+
+@pytest.mark.parametrize("data", [b"\x01", b"\x09\x00\x00\x00abc"])
+def test_binary_strings_that_end_early_are_refused(client: TestClient, data: bytes) -> None:
+    tensor = _tensor(datatype="BYTES", shape=[1], data=None, parameters={"binary_data_size": len(data)})
+    head = json.dumps(tensor).encode()
+    headers = {"inference-header-content-length": str(len(head))}
+    answer = client.post("/v2/models/tiny/infer", content=head + data, headers=headers)
+    assert answer.status_code == 400
+    assert "ends early" in answer.json()["error"]
+
+
+def test_other_models_and_versions_are_unknown(client: TestClient) -> None:
+    assert client.get("/v2/models/other").status_code == 404
+    assert client.get("/v2/models/tiny/versions/2/ready").status_code == 404
+    assert client.get("/v2/models/tiny/versions/1/ready").json()["ready"] is True
+
+
+def test_a_full_queue_is_told_in_the_protocols_form(make_app: MakeApp) -> None:
+    app = make_app(queue=1, max_images=1)
+    with TestClient(app) as client, app.service.admit(1):
+        answer = client.post("/v2/models/tiny/infer", json=_tensor())
+    assert answer.status_code == 503
+    assert int(answer.headers["retry-after"]) >= 1
+    assert "places are taken" in answer.json()["error"]

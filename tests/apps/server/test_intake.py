@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.apps.server.conftest import encode, picture
+from trilitenet.apps.server.intake import (
+    Header,
+    MemoryBudget,
+    Reservation,
+    check_header,
+    decode,
+    read_header,
+)
+from trilitenet.apps.server.problems import BusyError, ProblemError
+from trilitenet.apps.server.settings import Settings
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        ("JPEG", {}),
+        ("JPEG", {"progressive": True}),
+        ("JPEG", {"comment": b"x" * 3000}),
+        ("PNG", {}),
+        ("WEBP", {"lossless": True}),
+        ("WEBP", {"lossless": False}),
+        ("WEBP", {"icc_profile": b"x" * 200}),
+    ],
+)
+def test_headers_are_read_as_pillow_reads_them(kind: str, options: dict[str, object]) -> None:
+    data = encode(picture(61, 47), kind, **options)
+    header = read_header(data)
+    assert header[:3] == (kind, 61, 47)
+    assert (header.scans > 1) == bool(options.get("progressive"))
+    pixels = decode(data, header)
+    np.testing.assert_array_equal(pixels, np.asarray(Image.open(io.BytesIO(data)).convert("RGB")))
+
+
+def _png(width: int, height: int) -> bytes:
+    body = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunk = struct.pack(">I", 13) + b"IHDR" + body + struct.pack(">I", zlib.crc32(b"IHDR" + body))
+    return b"\x89PNG\r\n\x1a\n" + chunk
+
+
+@pytest.mark.parametrize(("width", "height"), [(60000, 60000), (20000, 1), (1, 20000), (2**31, 2**31)])
+def test_bombs_are_refused_by_their_header(width: int, height: int) -> None:
+    with pytest.raises(ProblemError) as caught:
+        check_header(read_header(_png(width, height)), Settings())
+    assert caught.value.status == 413
+
+
+def test_no_pixels_are_refused() -> None:
+    with pytest.raises(ProblemError) as caught:
+        check_header(read_header(_png(0, 5)), Settings())
+    assert caught.value.status == 422
+
+
+def test_scans_count_by_the_size_of_the_picture() -> None:
+    check_header(Header("JPEG", 1000, 1000, 200), Settings())
+    with pytest.raises(ProblemError, match="200 scans"):
+        check_header(Header("JPEG", 7000, 4000, 200), Settings())
+
+
+def test_the_largest_allowed_image_is_8k() -> None:
+    check_header(Header("PNG", 7680, 4320, 1), Settings())
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP"])
+def test_a_truncated_file_is_refused_unless_only_its_end_mark_is_missing(kind: str) -> None:
+    data = encode(picture(40, 30), kind)
+    whole = decode(data, read_header(data))
+    refused = 0
+    for length in range(len(data)):
+        try:
+            pixels = decode(data[:length], read_header(data[:length]))
+        except ProblemError as problem:
+            refused += problem.status in {400, 415, 422}
+        else:
+            np.testing.assert_array_equal(pixels, whole)
+    assert refused > len(data) - 32
+
+
+def test_a_header_that_contradicts_itself_is_refused() -> None:
+    data = encode(picture(40, 30), "PNG")
+    with pytest.raises(ProblemError, match="contradicts"):
+        decode(data, Header("PNG", 41, 30, 1))
+
+
+def test_another_format_than_its_header_is_refused() -> None:
+    with pytest.raises(ProblemError) as caught:
+        decode(encode(picture(), "PNG"), Header("JPEG", 64, 48, 1))
+    assert caught.value.status == 422
+
+
+def test_memory_is_given_back() -> None:
+    budget = MemoryBudget(100)
+    with Reservation(budget) as first:
+        first.take(60)
+        with Reservation(budget) as second:
+            second.take(40)
+            with pytest.raises(BusyError):
+                second.take(1)
+            assert budget.used == 100
+        assert budget.used == 60
+    assert budget.used == 0

@@ -1,0 +1,453 @@
+"""The page in a real browser: Debian's Chromium, driven by Selenium. Skipped where they are not installed.
+
+``TRILITENET_SCREENSHOTS`` names a folder for pictures of the page, to be looked at.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.apps.server.conftest import TOKEN, FakeBackend, Running, encode, picture
+from trilitenet.apps.server.application import create_app
+from trilitenet.apps.server.settings import Settings
+from trilitenet.inference.predictor import Predictor
+
+webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import WebDriverWait
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+CHROMEDRIVER = shutil.which("chromedriver")
+
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None or CHROMEDRIVER is None,
+    reason="no Chromium with chromedriver here (Debian: apt install chromium chromium-driver)",
+)
+
+
+class Page:
+    """The open page."""
+
+    def __init__(self, driver: Any, downloads: Path) -> None:
+        self.driver = driver
+        self.downloads = downloads
+
+    def __getitem__(self, identifier: str) -> Any:
+        return self.driver.find_element(By.ID, identifier)
+
+    def wait(self, condition: Callable[[], Any], seconds: float = 20) -> Any:
+        return WebDriverWait(self.driver, seconds, poll_frequency=0.05).until(lambda _: condition())
+
+    def script(self, text: str, *arguments: Any) -> Any:
+        return self.driver.execute_script(text, *arguments)
+
+    def open(self, url: str) -> None:
+        self.driver.get(url)
+        self.wait(lambda: "model tiny" in self["model"].text or self["token-form"].is_displayed())
+
+    def choose(self, file: Path) -> None:
+        self["file"].send_keys(str(file))
+
+    def see(self, file: Path) -> str:
+        self.choose(file)
+        self.wait(lambda: self["summary"].text.endswith("."))
+        return str(self["summary"].text)
+
+    def pixel(self, x: float, y: float) -> list[int]:
+        """Colour of the canvas at a place from 0 to 1."""
+        values: list[int] = self.script(
+            "const v = document.getElementById('view');"
+            "return [...v.getContext('2d').getImageData(v.width * arguments[0], v.height * arguments[1], 1, 1).data]",
+            x,
+            y,
+        )
+        return values[:3]
+
+    def set_range(self, identifier: str, value: float) -> None:
+        self.script(
+            "const e = document.getElementById(arguments[0]); e.value = arguments[1];"
+            "e.dispatchEvent(new Event('input', {bubbles: true}))",
+            identifier,
+            value,
+        )
+
+    def resize(self, width: int, height: int, *, phone: bool = False) -> None:
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 2 if phone else 1, "mobile": phone}
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+
+    def scheme(self, name: str) -> None:
+        features = [{"name": "prefers-color-scheme", "value": name}]
+        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+
+    def photograph(self, name: str) -> None:
+        folder = os.environ.get("TRILITENET_SCREENSHOTS")
+        if folder:
+            self.driver.save_screenshot(str(Path(folder) / f"{name}.png"))
+
+    def downloaded(self, name: str) -> Path:
+        path = self.downloads / name
+        self.wait(lambda: path.exists() and path.stat().st_size > 0)
+        return path
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    downloads = tmp_path_factory.mktemp("downloads")
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in (
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-dev-shm-usage",
+        "--disable-gpu",
+        "--use-fake-device-for-media-stream",
+        "--use-fake-ui-for-media-stream",
+        "--window-size=1280,900",
+        f"--user-data-dir={tmp_path_factory.mktemp('profile')}",
+    ):
+        options.add_argument(flag)
+    options.add_experimental_option("prefs", {"download.default_directory": str(downloads)})
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options, webdriver.ChromeService(CHROMEDRIVER))
+    yield Page(driver, downloads)
+    driver.quit()
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Running]:
+    running = Running(create_app(Predictor(FakeBackend()), "tiny", Settings(threads=2, drain=0.1)))
+    yield running
+    assert running.stop()
+
+
+@pytest.fixture
+def page(browser: Page, server: Running) -> Iterator[Page]:
+    """The page, fresh and of desktop size; afterwards the browser must not have complained."""
+    browser.resize(1280, 900)
+    browser.scheme("light")
+    browser.open(server.url)
+    browser.driver.get_log("browser")
+    yield browser
+    complaints = [entry["message"] for entry in browser.driver.get_log("browser") if entry["level"] == "SEVERE"]
+    # A refused request is logged by the browser itself; that is no fault of the page.
+    assert [text for text in complaints if "Failed to load resource" not in text] == []
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> Path:
+    path = tmp_path / "road.png"
+    path.write_bytes(encode(picture(640, 360), "PNG"))
+    return path
+
+
+def test_a_photo_is_uploaded_and_what_is_seen_appears(page: Page, photo: Path) -> None:
+    assert page["save-overlay"].get_attribute("disabled")
+    assert page.see(photo) == "2 vehicles; drivable area 50 % of the picture; lane markings 13 %."
+    assert page["view"].get_attribute("aria-label") == page["summary"].text
+    assert page.script("const v = document.getElementById('view'); return [v.width, v.height]") == [640, 360]
+    assert page.pixel(0.9, 0.1) == [30, 60, 90]
+    tinted = np.round(0.45 * np.array([0, 158, 115]) + 0.55 * np.array([30, 60, 90]))
+    np.testing.assert_allclose(page.pixel(0.1, 0.9), tinted, atol=2)
+    stages = [row.text.rsplit(" ", 1)[0] for row in page["timing"].find_elements(By.TAG_NAME, "tr")]
+    assert stages == ["decode", "preprocess", "queue", "network", "postprocess", "round trip"]
+    assert _overlaps(page) == []
+    page.photograph("photo")
+
+
+def _overlaps(page: Page) -> list[str]:
+    """Labels whose text lies under a control beside it."""
+    names: list[str] = page.script(
+        "return [...document.querySelectorAll('.layer')].filter((layer) => {"
+        "const range = document.createRange(); range.selectNodeContents(layer.querySelector('label'));"
+        "const text = range.getBoundingClientRect();"
+        "const slider = layer.querySelector('input[type=range]').getBoundingClientRect();"
+        "return text.right > slider.left && text.left < slider.right"
+        "  && text.bottom > slider.top && text.top < slider.bottom;"
+        "}).map((layer) => layer.innerText)"
+    )
+    return names
+
+
+def test_masks_lie_where_the_service_says(page: Page, server: Running, photo: Path) -> None:
+    page.see(photo)
+    page.script("for (const n of ['detection', 'drivable']) document.getElementById('show-' + n).click()")
+    page.set_range("opacity-lane", 100)
+    shown = np.array(
+        page.script(
+            "const v = document.getElementById('view');"
+            "return [...v.getContext('2d').getImageData(0, 0, v.width, v.height).data]"
+        )
+    )
+    yellow = (shown.reshape(360, 640, 4)[..., :3] == (240, 228, 66)).all(axis=2)
+    np.testing.assert_array_equal(yellow, server.app.service.predictor(photo).lane)
+
+
+def test_toggles_and_opacity_draw_again(page: Page, photo: Path) -> None:
+    page.see(photo)
+    before = page.pixel(0.1, 0.9)
+    page["show-drivable"].click()
+    assert page.pixel(0.1, 0.9) == [30, 60, 90]
+    page["show-drivable"].click()
+    assert page.pixel(0.1, 0.9) == before
+    page.set_range("opacity-drivable", 100)
+    assert page.pixel(0.1, 0.9) == [0, 158, 115]
+    edge = (0.25 - 0.1, 0.5)
+    assert page.pixel(*edge) != page.pixel(0.05, 0.4)
+    page["show-detection"].click()
+    page.set_range("opacity-drivable", 10)
+    np.testing.assert_allclose(page.pixel(*edge), page.pixel(0.05, edge[1]), atol=2)
+
+
+def test_the_slider_chooses_boxes(page: Page, photo: Path) -> None:
+    page.see(photo)
+    counts = {}
+    for value in (0.05, 0.3, 0.6, 0.95):
+        page.set_range("confidence", value)
+        counts[value] = page["objects-count"].get_attribute("textContent").strip()
+    assert counts == {0.05: "(3)", 0.3: "(2)", 0.6: "(1)", 0.95: "(0)"}
+    assert page["summary"].text.startswith("no vehicle;")
+
+
+def test_overlay_and_json_are_saved(page: Page, server: Running, photo: Path) -> None:
+    page.see(photo)
+    page["save-overlay"].click()
+    with Image.open(page.downloaded("road-overlay.png")) as overlay:
+        assert overlay.size == (640, 360)
+        np.testing.assert_array_equal(np.asarray(overlay)[324, 64, :3], page.pixel(0.1, 0.9))
+    page.set_range("confidence", 0.6)
+    page["save-json"].click()
+    saved = json.loads(page.downloaded("road.json").read_text())
+    expected = server.app.service.predictor(photo).to_dict()
+    assert saved["drivable"] == expected["drivable"]
+    assert saved["boxes"] == expected["boxes"][:1]
+    assert saved["source"] == "road"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("broken.jpg", encode(picture(640, 360))[:900], "broken or truncated"),
+        ("letter.txt", b"Dear service", "not a JPEG, PNG or WebP"),
+        ("empty.png", b"", "empty"),
+        ("broken.mp4", b"\0\0\0\x18ftypmp42 no clip", "cannot be played"),
+    ],
+)
+def test_a_broken_file_is_explained_and_the_page_goes_on(
+    page: Page, photo: Path, tmp_path: Path, name: str, content: bytes, message: str
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    page.choose(path)
+    page.wait(lambda: message in page["error"].text)
+    assert page["error"].get_attribute("role") == "alert"
+    if name == "broken.jpg":
+        page.photograph("error")
+    page.see(photo)
+    assert not page["error"].is_displayed()
+
+
+def test_the_keyboard_is_enough(page: Page, photo: Path) -> None:
+    page.see(photo)
+    page.script("document.activeElement.blur(); window.scrollTo(0, 0)")
+    order = []
+    for _ in range(30):
+        webdriver.ActionChains(page.driver).send_keys(Keys.TAB).perform()
+        focused = page.script("return document.activeElement.id || document.activeElement.className || 'summary'")
+        if focused in order[-1:] or (order and focused == order[0]):
+            break
+        order.append(focused)
+        if focused not in {"BODY", ""}:
+            outline = page.script(
+                "const e = document.activeElement;"
+                "return getComputedStyle(e.matches('.file input') ? e.nextElementSibling : e).outlineStyle"
+            )
+            assert outline != "none", f"focus on {focused} cannot be seen"
+    wanted = ["skip", "file", "camera", "rate", "save-overlay", "save-json", "show-detection", "opacity-detection"]
+    wanted += ["show-drivable", "opacity-drivable", "show-lane", "opacity-lane", "confidence"]
+    assert [name for name in order if name in wanted] == wanted
+    page["show-drivable"].send_keys(Keys.SPACE)
+    assert page.pixel(0.1, 0.9) == [30, 60, 90]
+    page["confidence"].send_keys(Keys.END)
+    assert page["confidence-text"].text == "0.95"
+    page["confidence"].send_keys(Keys.HOME, Keys.ARROW_RIGHT)
+    assert page["confidence-text"].text == "0.06"
+    page["save-json"].send_keys(Keys.ENTER)
+    page.downloaded("road.json")
+
+
+def test_everything_has_a_name_for_screen_readers(page: Page, photo: Path) -> None:
+    page.see(photo)
+    controls = page.driver.find_elements(By.CSS_SELECTOR, "input, button, select, canvas, summary, progress")
+    nameless = [control.get_attribute("id") for control in controls if not control.accessible_name]
+    # Hidden ones have no name in the accessibility tree.
+    hidden = {control.get_attribute("id") for control in controls if not control.is_displayed()}
+    assert set(nameless) <= hidden
+    assert page["summary"].aria_role == "status"
+    assert page.script("return document.documentElement.lang") == "en"
+    headings = [heading.tag_name for heading in page.driver.find_elements(By.CSS_SELECTOR, "h1, h2, h3")]
+    assert headings == ["h1", "h2", "h2"]
+
+
+@pytest.mark.parametrize("width", [320, 390])
+def test_it_fits_a_phone(page: Page, photo: Path, width: int) -> None:
+    page.resize(width, 780, phone=True)
+    page.see(photo)
+    assert page.script("return document.documentElement.scrollWidth") <= width
+    small = page.script(
+        "return [...document.querySelectorAll('button, select, .button, summary')]"
+        ".filter((e) => e.offsetParent && e.getBoundingClientRect().height < 24).map((e) => e.id)"
+    )
+    assert small == []
+    assert _overlaps(page) == []
+    page.photograph(f"phone-{width}")
+
+
+def test_dark_and_light_can_both_be_read(page: Page, photo: Path) -> None:
+    page.see(photo)
+    backs = []
+    for scheme in ("light", "dark"):
+        page.scheme(scheme)
+        for selector in ("h1", ".hint", "#summary", ".primary", "#camera", "td", "summary span"):
+            ink, back = page.script(
+                "let e = document.querySelector(arguments[0]); const ink = getComputedStyle(e).color;"
+                "while (getComputedStyle(e).backgroundColor === 'rgba(0, 0, 0, 0)') e = e.parentElement;"
+                "return [ink, getComputedStyle(e).backgroundColor]",
+                selector,
+            )
+            assert _contrast(ink, back) >= 4.5, (scheme, selector, ink, back)
+        backs.append(page.script("return getComputedStyle(document.body).backgroundColor"))
+        page.photograph(f"desktop-{scheme}")
+        page.resize(390, 844, phone=True)
+        page.photograph(f"phone-{scheme}")
+        page.resize(1280, 900)
+    assert backs[0] != backs[1]
+
+
+def _contrast(ink: str, back: str) -> float:
+    """Contrast ratio of WCAG 2.1 of two CSS colours."""
+    luminances = []
+    for colour in (ink, back):
+        channels = np.array([float(part) for part in colour.strip("rgba()").split(",")[:3]]) / 255
+        linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+        luminances.append(float(linear @ [0.2126, 0.7152, 0.0722]))
+    return (max(luminances) + 0.05) / (min(luminances) + 0.05)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three seconds in which the picture grows lighter."""
+    path = tmp_path_factory.mktemp("clip") / "drive.webm"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"VP80"), 10, (320, 192))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV cannot write WebM")
+    for index in range(30):
+        writer.write(np.full((192, 320, 3), 8 * index, np.uint8))
+    writer.release()
+    return path
+
+
+def test_a_clip_is_seen_in_chunks_with_progress(page: Page, server: Running, clip: Path) -> None:
+    batches = _counted(server, "/v1/predict/batch")
+    page.choose(clip)
+    page.wait(lambda: page["progress-row"].is_displayed())
+    page.wait(lambda: not page["progress-row"].is_displayed() and page["player"].is_displayed())
+    frames = int(page["seek"].get_attribute("max")) + 1
+    assert 13 <= frames <= 16
+    assert _counted(server, "/v1/predict/batch") - batches == 2
+    page.set_range("seek", 1)
+    page.wait(lambda: page["seek-text"].text.startswith("2 /"))
+    early = page.pixel(0.9, 0.1)
+    page.set_range("seek", frames - 2)
+    page.wait(lambda: page["seek-text"].text.startswith(f"{frames - 1} /"))
+    assert page.pixel(0.9, 0.1)[0] > early[0] + 100
+    page.photograph("clip")
+    page["play"].click()
+    page.wait(lambda: page["seek-text"].text.startswith(f"{frames} /"))
+    page["save-json"].click()
+    saved = json.loads(page.downloaded("drive.json").read_text())
+    assert [entry["frame"] for entry in saved] == list(range(frames))
+    assert saved[5]["timestamp"] == 1.0
+    page["save-clip"].click()
+    assert page.downloaded("drive.webm").read_bytes()[:4] == b"\x1a\x45\xdf\xa3"
+
+
+def test_a_clip_can_be_stopped(page: Page, clip: Path) -> None:
+    page.script("document.getElementById('rate').value = '10'")
+    page.choose(clip)
+    page.wait(lambda: page["stop"].is_displayed())
+    page["stop"].click()
+    page.wait(lambda: not page["progress-row"].is_displayed())
+    assert not page["error"].is_displayed()
+
+
+def _counted(server: Running, route: str) -> float:
+    name = "trilitenet_requests_total"
+    labels = {"route": route, "method": "POST", "status": "200"}
+    return server.app.service.metrics.registry.get_sample_value(name, labels) or 0.0
+
+
+def test_the_camera_runs_until_it_is_stopped(page: Page, server: Running) -> None:
+    before = _counted(server, "/v1/predict")
+    page["camera"].click()
+    page.wait(lambda: page["view"].is_displayed() and _counted(server, "/v1/predict") >= before + 3)
+    page.photograph("camera")
+    page["stop"].click()
+    page.wait(lambda: not page["stop"].is_displayed())
+    time.sleep(0.3)
+    settled = _counted(server, "/v1/predict")
+    time.sleep(0.5)
+    assert _counted(server, "/v1/predict") == settled
+    assert page["save-overlay"].is_enabled()
+    assert not page["error"].is_displayed()
+
+
+def test_a_dropped_photo_is_taken(page: Page, photo: Path) -> None:
+    page.script(
+        "const bytes = Uint8Array.from(arguments[0]); const transfer = new DataTransfer();"
+        "transfer.items.add(new File([bytes], 'dropped.png', {type: 'image/png'}));"
+        "document.body.dispatchEvent(new DragEvent('drop', {dataTransfer: transfer, bubbles: true, cancelable: true}))",
+        list(photo.read_bytes()),
+    )
+    page.wait(lambda: page["summary"].text.startswith("2 vehicles"))
+
+
+def test_a_huge_photo_is_made_smaller_before_it_is_sent(page: Page, tmp_path: Path) -> None:
+    path = tmp_path / "huge.jpg"
+    path.write_bytes(encode(picture(4000, 1000)))
+    page.see(path)
+    assert page.script("return document.getElementById('view').width") == 2560
+
+
+def test_nothing_comes_from_elsewhere(page: Page, server: Running, photo: Path) -> None:
+    page.see(photo)
+    names = page.script("return performance.getEntriesByType('resource').map((entry) => entry.name)")
+    assert names
+    assert all(name.startswith((server.url, "blob:")) for name in names)
+
+
+def test_a_token_is_asked_for_and_used(browser: Page, photo: Path) -> None:
+    running = Running(create_app(Predictor(FakeBackend()), "tiny", Settings(threads=1, drain=0.1, token=TOKEN)))
+    try:
+        browser.open(running.url)
+        browser.wait(lambda: browser["token-form"].is_displayed())
+        browser["token"].send_keys("a wrong one", Keys.ENTER)
+        browser.wait(lambda: browser["token-form"].is_displayed() and not browser["token"].get_attribute("value"))
+        browser["token"].send_keys(TOKEN, Keys.ENTER)
+        browser.wait(lambda: "model tiny" in browser["model"].text)
+        assert not browser["token-form"].is_displayed()
+        assert browser.see(photo).startswith("2 vehicles")
+    finally:
+        assert running.stop()

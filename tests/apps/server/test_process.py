@@ -1,0 +1,274 @@
+from __future__ import annotations
+
+import http.client
+import json
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+from tests.apps.server.conftest import FakeBackend, MakeApp, Running, encode, picture
+from trilitenet.apps.server.application import Application
+from trilitenet.apps.server.process import JsonFormatter
+
+Run = Callable[[Application], Running]
+
+
+def _connect(running: Running) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", running.port), timeout=10)
+
+
+def _read_all(connection: socket.socket) -> bytes:
+    pieces = []
+    while piece := connection.recv(65536):
+        pieces.append(piece)
+    return b"".join(pieces)
+
+
+def test_a_silent_connection_is_closed(make_app: MakeApp, run_app: Run) -> None:
+    with _connect(run_app(make_app(header_timeout=0.2))) as connection:
+        assert b" 408 " in _read_all(connection)
+
+
+def test_headers_that_trickle_are_cut_off(make_app: MakeApp, run_app: Run) -> None:
+    with _connect(run_app(make_app(header_timeout=0.3))) as connection:
+        start = time.monotonic()
+        connection.sendall(b"GET / HTTP/1.1\r\n")
+        answer = b""
+        while not answer and time.monotonic() - start < 5:
+            connection.sendall(b"x: y\r\n")
+            connection.settimeout(0.05)
+            try:
+                answer = connection.recv(1000)
+            except TimeoutError:
+                continue
+        assert b" 408 " in answer
+        assert time.monotonic() - start < 2
+
+
+def test_line_breaks_do_not_keep_a_connection_open(make_app: MakeApp, run_app: Run) -> None:
+    running = run_app(make_app(header_timeout=0.3, keep_alive=0.3))
+    with _connect(running) as connection:
+        connection.sendall(b"GET /healthz HTTP/1.1\r\nhost: x\r\n\r\n")
+        assert connection.recv(10000).startswith(b"HTTP/1.1 200")
+        connection.sendall(b"\r\n")
+        start = time.monotonic()
+        _read_all(connection)
+        assert time.monotonic() - start < 3
+
+
+def test_endless_headers_are_refused(app: Application, run_app: Run) -> None:
+    with _connect(run_app(app)) as connection:
+        connection.sendall(b"GET / HTTP/1.1\r\nx: ")
+        try:
+            for _ in range(100):
+                connection.sendall(b"y" * 1000)
+        except OSError:
+            pass
+        assert connection.recv(1000).startswith(b"HTTP/1.1 431")
+
+
+def test_a_body_that_trickles_is_cut_off(make_app: MakeApp, run_app: Run) -> None:
+    with _connect(run_app(make_app(upload_timeout=0.3))) as connection:
+        connection.sendall(b"POST /v1/predict HTTP/1.1\r\nhost: x\r\ncontent-length: 1000\r\n\r\nx")
+        start = time.monotonic()
+        answer = _read_all(connection)
+        assert answer.startswith(b"HTTP/1.1 408")
+        assert b'"upload_timeout"' in answer
+        assert time.monotonic() - start < 3
+
+
+def test_four_gigabytes_are_refused_at_once(app: Application, run_app: Run) -> None:
+    with _connect(run_app(app)) as connection:
+        start = time.monotonic()
+        connection.sendall(
+            b"POST /v1/predict HTTP/1.1\r\nhost: x\r\nexpect: 100-continue\r\ncontent-length: 4294967296\r\n\r\n"
+        )
+        assert connection.recv(1000).startswith(b"HTTP/1.1 413")
+        assert time.monotonic() - start < 1
+
+
+def test_too_many_connections_are_refused_and_the_rest_served(make_app: MakeApp, run_app: Run) -> None:
+    running = run_app(make_app(max_connections=2))
+    with _connect(running) as first, _connect(running) as second:
+        second.sendall(b"GET /healthz HTTP/1.1\r\nhost: x\r\n\r\n")
+        assert second.recv(1000).startswith(b"HTTP/1.1 200")
+        with _connect(running) as third:
+            answer = _read_all(third)
+            assert answer.startswith(b"HTTP/1.1 503")
+            assert b"retry-after" in answer
+        first.sendall(b"GET /healthz HTTP/1.1\r\nhost: x\r\n\r\n")
+        assert first.recv(1000).startswith(b"HTTP/1.1 200")
+
+
+def test_slow_clients_do_not_hold_up_others(make_app: MakeApp, run_app: Run, jpeg: bytes) -> None:
+    running = run_app(make_app(queue=2, max_images=2))
+    slow = [_connect(running) for _ in range(20)]
+    for connection in slow:
+        connection.sendall(b"POST /v1/predict HTTP/1.1\r\nhost: x\r\ncontent-length: 1000\r\n\r\n\xff")
+    client = http.client.HTTPConnection("127.0.0.1", running.port, timeout=10)
+    for _ in range(5):
+        client.request("POST", "/v1/predict", body=jpeg)
+        answer = client.getresponse()
+        answer.read()
+        assert answer.status == 200
+    client.close()
+    for connection in slow:
+        connection.close()
+
+
+def test_a_client_that_does_not_read_is_cut_off(make_app: MakeApp, run_app: Run) -> None:
+    running = run_app(make_app(send_timeout=0.5))
+    big = encode(picture(4000, 3000), "PNG")
+    connection = socket.socket()
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    connection.connect(("127.0.0.1", running.port))
+    head = b"POST /v1/predict?format=overlay HTTP/1.1\r\nhost: x\r\naccept: image/png\r\ncontent-length: %d\r\n\r\n"
+    connection.sendall(head % len(big) + big)
+    until = time.monotonic() + 15
+    while not running.server.server_state.total_requests and time.monotonic() < until:
+        time.sleep(0.05)
+    while running.server.server_state.connections and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not running.server.server_state.connections
+    connection.close()
+
+
+def test_a_full_queue_is_told_with_retry_after(
+    make_app: MakeApp, run_app: Run, backend: FakeBackend, jpeg: bytes
+) -> None:
+    running = run_app(make_app(queue=3, max_images=3))
+    backend.gate.clear()
+    statuses: list[int] = []
+    headers: list[str | None] = []
+
+    def post() -> None:
+        client = http.client.HTTPConnection("127.0.0.1", running.port, timeout=20)
+        client.request("POST", "/v1/predict", body=jpeg)
+        answer = client.getresponse()
+        answer.read()
+        statuses.append(answer.status)
+        headers.append(answer.headers["retry-after"])
+        client.close()
+
+    threads = [threading.Thread(target=post) for _ in range(10)]
+    for thread in threads:
+        thread.start()
+    until = time.monotonic() + 10
+    while len(statuses) < 7 and time.monotonic() < until:
+        time.sleep(0.01)
+    backend.gate.set()
+    for thread in threads:
+        thread.join(20)
+    assert Counter(statuses) == {200: 3, 503: 7}
+    assert sum(header is not None for header in headers) == 7
+
+
+def test_an_image_that_waits_too_long_gets_503(
+    make_app: MakeApp, run_app: Run, backend: FakeBackend, jpeg: bytes
+) -> None:
+    running = run_app(make_app(deadline=0.2))
+    backend.gate.clear()
+    client = http.client.HTTPConnection("127.0.0.1", running.port, timeout=20)
+    client.request("POST", "/v1/predict", body=jpeg)
+    answer = client.getresponse()
+    assert answer.status == 503
+    assert json.load(answer)["error"]["code"] == "deadline"
+    backend.gate.set()
+    client.close()
+
+
+SCRIPT = """
+import sys
+from tests.apps.server.conftest import FakeBackend
+from trilitenet.apps.server.application import create_app
+from trilitenet.apps.server.process import build_server, set_up_logs
+from trilitenet.apps.server.settings import Settings
+from trilitenet.inference.predictor import Predictor
+
+set_up_logs()
+app = create_app(Predictor(FakeBackend(seconds=0.01)), "tiny", Settings(queue=32, threads=2, drain=0.5))
+server = build_server(app, "127.0.0.1", 0)
+startup = server.startup
+
+async def announce(sockets=None):
+    await startup(sockets)
+    sys.stdout.write(f"{server.servers[0].sockets[0].getsockname()[1]}\\n")
+    sys.stdout.flush()
+
+server.startup = announce
+server.run()
+"""
+
+
+def test_sigterm_under_load_loses_no_accepted_request(jpeg: bytes) -> None:
+    root = Path(__file__).resolve().parents[3]
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT], cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONPATH": f"{root}{os.pathsep}{root / 'src'}"},
+    )  # fmt: skip
+    assert process.stdout is not None
+    port = int(process.stdout.readline())
+    outcomes: Counter[str] = Counter()
+    stop = threading.Event()
+
+    def load(number: int) -> None:
+        client = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+        count = 0
+        while not stop.is_set():
+            try:
+                client.connect() if client.sock is None else None
+            except OSError:
+                outcomes["refused"] += 1  # never accepted: the listener is closed
+                return
+            try:
+                client.request("POST", "/v1/predict", body=jpeg, headers={"x-request-id": f"{number}-{count}"})
+                answer = client.getresponse()
+                json.load(answer)
+                outcomes[str(answer.status)] += 1
+                if answer.will_close:
+                    client.close()
+            except (OSError, http.client.HTTPException) as error:
+                outcomes[f"lost: {type(error).__name__}"] += 1
+                client.close()
+            count += 1
+
+    threads = [threading.Thread(target=load, args=(number,)) for number in range(12)]
+    for thread in threads:
+        thread.start()
+    time.sleep(1.0)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=30)
+    stop.set()
+    for thread in threads:
+        thread.join(20)
+    logged = [json.loads(line) for line in errors.splitlines()]
+    answered = [entry for entry in logged if entry["message"] == "request"]
+    assert {entry["status"] for entry in answered} <= {200, 503}
+    assert outcomes.pop("refused", 0) == len(threads)
+    assert outcomes["200"] > 20
+    assert set(outcomes) <= {"200", "503"}, outcomes
+    assert sum(outcomes.values()) == len(answered)
+    assert process.returncode in {0, -signal.SIGTERM}
+
+
+def test_log_lines_are_json_with_the_fields() -> None:
+    record = logging.makeLogRecord({"name": "a", "levelname": "INFO", "msg": "x %d", "args": (3,), "request_id": "7"})
+    entry = json.loads(JsonFormatter().format(record))
+    assert entry["message"] == "x 3"
+    assert entry["request_id"] == "7"
+    assert entry["time"].endswith("Z")
+    try:
+        raise ValueError("two\nlines")
+    except ValueError:
+        record = logging.getLogger("a").makeRecord("a", 40, "f", 1, "y", (), sys.exc_info())
+    text = JsonFormatter().format(record)
+    assert "\n" not in text
+    assert "ValueError" in json.loads(text)["exception"]

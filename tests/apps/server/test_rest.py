@@ -1,0 +1,195 @@
+from __future__ import annotations
+
+import io
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from starlette.testclient import TestClient
+
+from tests.apps.server.conftest import FakeBackend, MakeApp, encode, picture
+from trilitenet.apps.server.application import Application
+from trilitenet.apps.server.openapi import BatchPrediction, Prediction
+from trilitenet.structures import Perception
+
+
+def test_predict_takes_a_body_or_a_form_and_answers_alike(client: TestClient, jpeg: bytes) -> None:
+    body = client.post("/v1/predict", content=jpeg, headers={"content-type": "image/jpeg"})
+    form = client.post("/v1/predict", files={"image": ("../../etc/passwd", jpeg, "text/plain")})
+    assert body.status_code == form.status_code == 200
+    assert body.json()["perception"] == form.json()["perception"]
+
+
+def test_predict_agrees_with_the_predictor(client: TestClient, app: Application) -> None:
+    pixels = picture(80, 60)
+    answer = client.post("/v1/predict", content=encode(pixels, "PNG")).json()
+    Prediction.model_validate(answer)
+    assert answer["perception"] == app.service.predictor(pixels).to_dict()
+    assert answer["model"] == "tiny"
+    assert {"decode", "preprocess", "queue", "network", "postprocess"} == set(answer["milliseconds"])
+    seen = Perception.from_dict(answer["perception"])
+    assert seen.drivable is not None
+    assert seen.drivable[-1].all()
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP"])
+def test_formats_are_told_by_their_bytes(client: TestClient, kind: str) -> None:
+    data = encode(picture(), kind)
+    answer = client.post("/v1/predict", content=data, headers={"content-type": "application/x-nonsense"})
+    assert answer.status_code == 200
+    assert answer.json()["perception"]["size"] == {"height": 48, "width": 64}
+
+
+def test_exif_rotation_is_applied(client: TestClient) -> None:
+    image = Image.fromarray(picture(64, 48))
+    exif = image.getexif()
+    exif[0x0112] = 6
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", exif=exif)
+    answer = client.post("/v1/predict", content=buffer.getvalue()).json()
+    assert answer["perception"]["size"] == {"height": 64, "width": 48}
+
+
+def test_confidence_replaces_the_threshold(client: TestClient, jpeg: bytes) -> None:
+    def count(query: str) -> int:
+        return len(client.post(f"/v1/predict{query}", content=jpeg).json()["perception"]["boxes"])
+
+    assert [count(""), count("?confidence=0.05"), count("?confidence=0.6")] == [2, 3, 1]
+
+
+def test_overlay_is_the_picture_with_everything_drawn(client: TestClient, app: Application) -> None:
+    pixels = picture(80, 60)
+    answer = client.post("/v1/predict?format=overlay", content=encode(pixels, "PNG"), headers={"accept": "image/png"})
+    assert answer.headers["content-type"] == "image/png"
+    drawn = np.asarray(Image.open(io.BytesIO(answer.content)))
+    np.testing.assert_array_equal(drawn, app.service.predictor(pixels).draw())
+    assert "network;dur=" in answer.headers["server-timing"]
+    jpeg = client.post("/v1/predict?format=overlay", content=encode(pixels, "PNG"))
+    assert jpeg.headers["content-type"] == "image/jpeg"
+    assert Image.open(io.BytesIO(jpeg.content)).size == (80, 60)
+
+
+def test_masks_are_one_palette_picture(client: TestClient, app: Application) -> None:
+    pixels = picture(80, 60)
+    answer = client.post("/v1/predict?format=masks", content=encode(pixels, "PNG"))
+    image = Image.open(io.BytesIO(answer.content))
+    assert image.mode == "P"
+    values = np.asarray(image)
+    seen = app.service.predictor(pixels)
+    np.testing.assert_array_equal(values & 1 > 0, seen.drivable)
+    np.testing.assert_array_equal(values & 2 > 0, seen.lane)
+    assert set(np.unique(values)) == {0, 1, 2, 3}
+
+
+def test_a_batch_gives_each_image_its_own_status(client: TestClient, jpeg: bytes, backend: FakeBackend) -> None:
+    files = [
+        ("images", ("a", jpeg)),
+        ("images", ("b", b"no image")),
+        ("images", ("c", encode(picture(32, 64), "PNG"))),
+        ("images", ("d", jpeg[:-30])),
+    ]
+    answer = client.post("/v1/predict/batch", files=files)
+    assert answer.status_code == 200
+    BatchPrediction.model_validate(answer.json())
+    results = answer.json()["results"]
+    assert [result["status"] for result in results] == [200, 415, 200, 422]
+    assert results[2]["perception"]["size"] == {"height": 64, "width": 32}
+
+
+def test_a_batch_has_a_largest_size(make_app: MakeApp, jpeg: bytes) -> None:
+    with TestClient(make_app(max_images=2)) as client:
+        answer = client.post("/v1/predict/batch", files=[("images", ("a", jpeg))] * 3)
+    assert answer.status_code == 413
+
+
+@pytest.mark.parametrize(
+    ("content", "headers", "status", "code"),
+    [
+        (b"", {}, 400, "empty"),
+        (b"hello", {}, 415, "unsupported_type"),
+        (b"GIF89a" + bytes(100), {"content-type": "image/jpeg"}, 415, "unsupported_type"),
+        (encode(picture())[:200], {}, 422, "broken_image"),
+        (b"--x\r\n", {"content-type": "multipart/form-data"}, 400, "bad_form"),
+        (b"--x--\r\n", {"content-type": "multipart/form-data; boundary=x"}, 400, "empty"),
+        (
+            b'--x\r\nContent-Disposition: form-data; name="file"\r\n\r\nhello\r\n--x--\r\n',
+            {"content-type": "multipart/form-data; boundary=x"},
+            400,
+            "unknown_field",
+        ),
+        (b"x", {"content-encoding": "gzip"}, 415, "content_encoding"),
+        (b"x", {"sec-fetch-site": "cross-site"}, 403, "cross_site"),
+    ],
+)
+def test_refusals_have_one_form(
+    client: TestClient, content: bytes, headers: dict[str, str], status: int, code: str
+) -> None:
+    answer = client.post("/v1/predict", content=content, headers=headers)
+    assert answer.status_code == status
+    error = answer.json()["error"]
+    assert error["code"] == code
+    assert error["request_id"] == answer.headers["x-request-id"]
+
+
+@pytest.mark.parametrize("query", ["?confidence=2", "?confidence=x", "?format=exe"])
+def test_bad_parameters_are_named(client: TestClient, jpeg: bytes, query: str) -> None:
+    answer = client.post(f"/v1/predict{query}", content=jpeg)
+    assert answer.status_code == 422
+    assert answer.json()["error"]["message"].startswith(query[1:].split("=")[0])
+
+
+def test_models_shows_the_card(client: TestClient) -> None:
+    (model,) = client.get("/v1/models").json()["models"]
+    assert model["name"] == "tiny"
+    assert model["backend"] == "fake"
+    assert model["card"]["licence"] == "MIT"
+
+
+def test_probes_follow_the_life_of_the_service(app: Application) -> None:
+    client = TestClient(app)
+    assert client.get("/healthz").status_code == 200
+    assert client.get("/readyz").status_code == 503
+    with client:
+        assert client.get("/readyz").status_code == 200
+        app.service.draining = True
+        answer = client.get("/readyz")
+        assert answer.status_code == 503
+        assert answer.headers["connection"] == "close"
+    assert client.get("/healthz").status_code == 503
+
+
+def test_a_backend_that_fails_is_an_answer_not_an_end(client: TestClient, jpeg: bytes, backend: FakeBackend) -> None:
+    backend.error = RuntimeError("secret detail")
+    answer = client.post("/v1/predict", content=jpeg)
+    assert answer.status_code == 500
+    assert "secret" not in answer.text
+    backend.error = None
+    assert client.post("/v1/predict", content=jpeg).status_code == 200
+
+
+def test_metrics_count_what_happened(client: TestClient, jpeg: bytes) -> None:
+    client.post("/v1/predict", content=jpeg)
+    client.post("/v1/predict", content=b"no image")
+    client.get("/nowhere")
+    text = client.get("/metrics").text
+    assert 'trilitenet_requests_total{method="POST",route="/v1/predict",status="200"} 1.0' in text
+    assert 'trilitenet_requests_total{method="GET",route="other",status="404"} 1.0' in text
+    assert 'trilitenet_rejects_total{reason="unsupported_type"} 1.0' in text
+    for stage in ("upload", "decode", "preprocess", "queue", "network", "postprocess", "encode"):
+        assert f'trilitenet_stage_seconds_count{{stage="{stage}"}}' in text
+    assert "trilitenet_accepted 0.0" in text
+    assert "trilitenet_memory_bytes 0.0" in text
+
+
+def test_the_schema_describes_every_route_with_examples(app: Application) -> None:
+    schema: dict[str, Any] = app.api.openapi()
+    json.dumps(schema)
+    assert {"/v1/predict", "/v1/predict/batch", "/v1/models", "/healthz", "/readyz", "/metrics"} <= set(schema["paths"])
+    predict = schema["paths"]["/v1/predict"]["post"]
+    Prediction.model_validate(predict["responses"]["200"]["content"]["application/json"]["example"])
+    batch = schema["paths"]["/v1/predict/batch"]["post"]
+    BatchPrediction.model_validate(batch["responses"]["200"]["content"]["application/json"]["example"])
+    assert "multipart/form-data" in predict["requestBody"]["content"]
+    assert "Retry-After" in predict["responses"]["503"]["headers"]
