@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from trilitenet.processing.geometry import Camera
+from trilitenet.road.structures import EgoLane, Estimate, Event, GroundCurve, LaneLine, LeadVehicle, Road
 from trilitenet.structures import Boxes, Perception
 
 SIZE = (120, 200)
@@ -62,3 +64,20 @@ def video() -> list[Perception]:
             )
         )
     return frames
+
+
+@pytest.fixture
+def road() -> Road:
+    """A road with everything known of it."""
+    points = np.array([[40, 119], [60, 95.5], [95, 60]], np.float32)
+    curve = GroundCurve(np.array([1.8, 0.01, 0.001, 0.0]), 5.0, 40.0)
+    near = Estimate(0.25, 0.03)
+    return Road(
+        lines=(LaneLine(3, -1, points, np.zeros(6), (119.0, -59.0), 0.7, 0.9, curve),),
+        drivable=(points,),
+        ego_lane=EgoLane(Estimate(3.5, 0.1), near, Estimate(-0.01, 0.002), None),
+        lead=LeadVehicle(0, 7, Estimate(22.5, 1.1), Estimate(2.0, 0.5), None),
+        camera=Camera((120, 200), 150.0, 150.0, 99.5, 59.5, 1.4),
+        calibrated="file",
+        events=(Event("lane_departure_left", "begin", 0.04, 1, 0.1),),
+    )

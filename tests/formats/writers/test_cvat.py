@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from trilitenet.formats.writers.cvat import CvatWriter, cvat_mask
+from trilitenet.road.structures import Road
 from trilitenet.structures import Perception
 
 xmlschema = pytest.importorskip("xmlschema")
@@ -85,3 +86,15 @@ def test_datumaro_opens_it(tmp_path: Path, pictures: list[Perception]) -> None:
     assert sorted(kinds) == ["bbox", "bbox", "mask", "mask"]
     mask = next(annotation for annotation in item.annotations if annotation.type.name == "mask")
     np.testing.assert_array_equal(mask.image.astype(bool), pictures[0].drivable)
+
+
+def test_lines_of_lanes_are_polylines(
+    tmp_path: Path, pictures: list[Perception], video: list[Perception], road: Road
+) -> None:
+    with CvatWriter(tmp_path) as writer:
+        writer.write(pictures[0], road.to_dict())
+        writer.write(video[0], road.to_dict())
+    for path in writer.files:
+        xmlschema.XMLSchema(SCHEMA).validate(path)
+        (line,) = ElementTree.parse(path).getroot().iter("polyline")
+        assert line.get("points") == "40.50,119.50;60.50,96.00;95.50,60.50"

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import numpy as np
 import pytest
 
 from trilitenet.formats.writers.native import JsonLinesWriter, JsonWriter, read_schema, to_document
+from trilitenet.road.structures import Road
 from trilitenet.structures import SCHEMA_VERSION, Perception
 
 
@@ -62,3 +64,35 @@ def test_json_lines_are_readable_while_they_grow(tmp_path: Path, video: list[Per
 
 def test_the_schema_is_of_this_version() -> None:
     assert read_schema()["$id"].endswith(f":{SCHEMA_VERSION}")
+
+
+def test_the_road_follows_the_schema(
+    pictures: list[Perception], road: Road, validator: jsonschema.Draft202012Validator
+) -> None:
+    for known in (road, Road()):
+        document = to_document(pictures[0], known.to_dict())
+        validator.validate(json.loads(json.dumps(document)))
+        assert document["road"]["lines"] == known.to_dict()["lines"]
+    document["road"]["events"] = [{"kind": "lane_departure_up"}]
+    assert not validator.is_valid(document)
+
+
+def test_the_schema_describes_every_key(pictures: list[Perception], road: Road) -> None:
+    """No key is written that the schema does not describe."""
+    schema = read_schema()
+
+    def check(value: object, description: dict[str, Any], path: str) -> None:
+        if "$ref" in description:
+            check(value, schema["$defs"][description["$ref"].rpartition("/")[2]], path)
+        elif "oneOf" in description and value is not None:
+            check(value, next(option for option in description["oneOf"] if option.get("type") != "null"), path)
+        elif isinstance(value, dict):
+            known = description.get("properties", {})
+            assert set(value) <= set(known), path
+            for key, item in value.items():
+                check(item, known[key], f"{path}.{key}")
+        elif isinstance(value, list):
+            for item in value:
+                check(item, description.get("items", {}), f"{path}[]")
+
+    check(to_document(pictures[0], road.to_dict()), schema["$defs"]["perception"], "perception")

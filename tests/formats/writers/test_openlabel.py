@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from trilitenet.formats.writers.openlabel import OpenLabelWriter
+from trilitenet.road.structures import Road
 from trilitenet.structures import Perception
 
 
@@ -22,12 +23,17 @@ def write(output: Path, perceptions: list[Perception]) -> list[dict[str, Any]]:
     return [json.loads(path.read_text(encoding="utf-8")) for path in writer.files]
 
 
+def official_schema() -> jsonschema.Draft7Validator:
+    package = pytest.importorskip("uai_openlabel")
+    file = resources.files(package).joinpath("official_schema").joinpath("openlabel_json_schema.json")
+    return jsonschema.Draft7Validator(json.loads(file.read_text(encoding="utf-8")))
+
+
 def test_the_standards_own_schema_accepts_it(
     tmp_path: Path, pictures: list[Perception], video: list[Perception]
 ) -> None:
     package = pytest.importorskip("uai_openlabel")
-    file = resources.files(package).joinpath("official_schema").joinpath("openlabel_json_schema.json")
-    validator = jsonschema.Draft7Validator(json.loads(file.read_text(encoding="utf-8")))
+    validator = official_schema()
     documents = write(tmp_path, [*pictures, *video])
     assert len(documents) == 3
     for document in documents:
@@ -59,3 +65,26 @@ def test_objects_say_when_they_were_seen(tmp_path: Path, video: list[Perception]
     assert content["objects"]["1"]["frame_intervals"] == [{"frame_start": 0, "frame_end": 2}]
     assert content["frame_intervals"] == [{"frame_start": 0, "frame_end": 3}]
     assert content["frames"]["3"]["frame_properties"]["timestamp"] == 0.12
+
+
+def test_the_road_is_objects_and_a_context(tmp_path: Path, video: list[Perception], road: Road) -> None:
+    with OpenLabelWriter(tmp_path) as writer:
+        for frame in video[:2]:
+            writer.write(frame, road.to_dict())
+    document = json.loads(writer.files[0].read_text(encoding="utf-8"))
+    official_schema().validate(document)
+    content = document["openlabel"]
+    (uid,) = [uid for uid, thing in content["objects"].items() if thing["type"] == "lane line"]
+    curve = content["frames"]["1"]["objects"][uid]["object_data"]["poly2d"][0]["val"]
+    assert curve == [40.5, 119.5, 60.5, 96.0, 95.5, 60.5]
+    figures = {
+        figure["name"]: figure["val"] for figure in content["frames"]["0"]["contexts"]["0"]["context_data"]["num"]
+    }
+    assert figures == {
+        "lane_width": 3.5,
+        "lane_offset": 0.25,
+        "lane_heading": -0.01,
+        "lead_distance": 22.5,
+        "lead_closing_speed": 2.0,
+    }
+    assert content["contexts"]["0"]["frame_intervals"] == [{"frame_start": 0, "frame_end": 1}]

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from trilitenet.formats.writers.scalabel import ScalabelWriter
 from trilitenet.processing.serialise import decode_mask
+from trilitenet.road.structures import Road
 from trilitenet.structures import Perception
 
 
@@ -72,5 +73,20 @@ def test_scalabel_opens_it(tmp_path: Path, video: list[Perception]) -> None:
     loader = pytest.importorskip("scalabel.label.io")
     write(tmp_path, video)
     dataset = loader.load(str(tmp_path / "scalabel.json"))
-    assert [category.name for category in dataset.config.categories] == ["vehicle", "rider & bike", "drivable", "lane"]
+    assert [category.name for category in dataset.config.categories] == [
+        "vehicle",
+        "rider & bike",
+        "drivable",
+        "lane",
+        "lane line",
+    ]
     assert dataset.frames[0].labels[0].box2d.x2 == 60.0
+
+
+def test_lines_of_lanes_are_polylines(tmp_path: Path, pictures: list[Perception], road: Road) -> None:
+    with ScalabelWriter(tmp_path) as writer:
+        writer.write(pictures[1], road.to_dict())
+    (label,) = json.loads(writer.files[0].read_text(encoding="utf-8"))["frames"][0]["labels"]
+    assert label["poly2d"] == [
+        {"vertices": [[40.5, 119.5], [60.5, 96.0], [95.5, 60.5]], "types": "LLL", "closed": False}
+    ]

@@ -8,6 +8,7 @@ import pytest
 
 from trilitenet.formats.writers.tables import BOX_COLUMNS, FRAME_COLUMNS, CsvWriter, ParquetWriter
 from trilitenet.processing.serialise import decode_mask
+from trilitenet.road.structures import Road
 from trilitenet.structures import Perception
 
 
@@ -46,3 +47,11 @@ def test_parquet(tmp_path: Path, video: list[Perception]) -> None:
     mask = decode_mask({"size": [row["height"], row["width"]], "counts": row["drivable"]})
     np.testing.assert_array_equal(mask, video[1].drivable)
     assert table.slice(3, 1).to_pylist()[0]["lane"] is None
+
+
+def test_the_road_has_columns(tmp_path: Path, video: list[Perception], road: Road) -> None:
+    with CsvWriter(tmp_path) as writer:
+        writer.write(video[0], road.to_dict())
+    (row,) = read(tmp_path / "frames.csv")
+    assert (row["lane_offset"], row["lane_curvature"], row["lead_distance"]) == ("0.25", "", "22.5")
+    assert (row["lines"], row["events"]) == ("1", "lane_departure_left:begin")

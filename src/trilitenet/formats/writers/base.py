@@ -198,6 +198,12 @@ def dumps(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False, allow_nan=False)
 
 
+def polylines(road: Mapping[str, Any] | None) -> Iterator[tuple[int, list[list[float]]]]:
+    """Yield the id and the points of each line of a lane, near to far, in continuous pixels (not OpenCV's)."""
+    for line in () if road is None else road["lines"]:
+        yield line["id"], [[round(x + 0.5, 2), round(y + 0.5, 2)] for x, y in line["points"]]
+
+
 def rounded(values: Any, digits: int = 2) -> Iterator[float]:
     """Yield plain floats, rounded: pixels to a hundredth by default."""
     return (round(float(value), digits) for value in values)

@@ -2,7 +2,7 @@
 
 Formats: https://docs.cvat.ai/docs/dataset_management/formats/format-cvat/. Still images become one file of the kind
 *CVAT for images*, with masks as masks; each video becomes one of the kind *CVAT for video*, where CVAT knows no masks
-and the areas are polygons. A task needs the labels listed under ``meta``.
+and the areas are polygons. Lines of lanes are polylines. A task needs the labels listed under ``meta``.
 """
 
 from __future__ import annotations
@@ -16,13 +16,15 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.formats.writers.base import Writer
+from trilitenet.formats.writers.base import Writer, polylines
 from trilitenet.processing.polygons import mask_to_polygons
 from trilitenet.structures import Perception
 
 __all__ = ["CvatWriter", "cvat_mask"]
 
 _HEAD = '<?xml version="1.0" encoding="utf-8"?>\n<annotations>\n  <version>1.1</version>\n'
+
+_LINE = "lane line"
 
 
 class CvatWriter(Writer):
@@ -48,12 +50,12 @@ class CvatWriter(Writer):
             self._close_video()
             if self._images is None:
                 self._images = _ImagesFile(self.create("cvat-images.xml"), perception)
-            self._images.add(perception, self.image_name(perception))
+            self._images.add(perception, self.image_name(perception), road)
             return
         if self._video is None or self._video.source != perception.source:
             self._close_video()
             self._video = _VideoFile(self.create(f"{self.stem(perception)}.cvat-video.xml"), perception)
-        self._video.add(perception, self.tolerance)
+        self._video.add(perception, self.tolerance, road)
 
     def close(self) -> None:
         """Finish the files."""
@@ -100,7 +102,7 @@ def _partial(path: Path) -> Path:
 
 def _labels(perception: Perception) -> str:
     """Return the labels a task needs, as CVAT's ``meta`` lists them."""
-    names = [*perception.class_names, "drivable", "lane"]
+    names = [*perception.class_names, "drivable", "lane", _LINE]
     label = (
         "        <label><name>{}</name><type>any</type><attributes><attribute><name>confidence</name>"
         "<mutable>True</mutable><input_type>text</input_type><default_value></default_value><values></values>"
@@ -111,6 +113,10 @@ def _labels(perception: Perception) -> str:
 
 def _text(value: str) -> str:
     return value.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+
+
+def _points(points: list[list[float]]) -> str:
+    return ";".join(f"{x:.2f},{y:.2f}" for x, y in points)
 
 
 def _corners(box: NDArray[np.float32]) -> str:
@@ -131,7 +137,7 @@ class _ImagesFile:
         self._handle: IO[str] = self.partial.open("w", encoding="utf-8")
         self._handle.write(f"{_HEAD}  <meta>\n    <task>\n{_labels(first)}    </task>\n  </meta>\n")
 
-    def add(self, perception: Perception, name: str) -> None:
+    def add(self, perception: Perception, name: str, road: Mapping[str, Any] | None) -> None:
         height, width = perception.size
         write = self._handle.write
         write(f'  <image id="{self.count}" name={quoteattr(name)} width="{width}" height="{height}">\n')
@@ -151,6 +157,11 @@ class _ImagesFile:
                     f'    <box label={quoteattr(perception.class_names[class_id])} source="auto" occluded="0" '
                     f'{_corners(box)} z_order="1">{_confidence(float(score))}</box>\n'
                 )
+        for _, points in polylines(road):
+            write(
+                f'    <polyline label="{_LINE}" source="auto" occluded="0" points="{_points(points)}" '
+                'z_order="1"></polyline>\n'
+            )
         write("  </image>\n")
         self.count += 1
 
@@ -178,7 +189,7 @@ class _Track:
     def _line(self, frame: int, attributes: str, inside: str, outside: int) -> str:
         return (
             f'    <{self.shape} frame="{frame}" keyframe="1" outside="{outside}" occluded="0" {attributes} '
-            f'z_order="{int(self.shape == "box")}">{inside}</{self.shape}>\n'
+            f'z_order="{int(self.shape != "polygon")}">{inside}</{self.shape}>\n'
         )
 
 
@@ -196,15 +207,17 @@ class _VideoFile:
         self._frames: list[int] = []
         self._tracks: dict[object, _Track] = {}
 
-    def add(self, perception: Perception, tolerance: float) -> None:
+    def add(self, perception: Perception, tolerance: float, road: Mapping[str, Any] | None) -> None:
         frame = perception.frame or 0
         self._frames.append(frame)
         for label, mask in (("drivable", perception.drivable), ("lane", perception.lane)):
             polygons = [] if mask is None else mask_to_polygons(mask, tolerance=tolerance)
             for rank, polygon in enumerate(polygons):
-                points = ";".join(f"{x:.2f},{y:.2f}" for x, y in (polygon + 0.5).tolist())
                 track = self._tracks.setdefault((label, rank), _Track(label, "polygon"))
-                track.shapes[frame] = (f'points="{points}"', "")
+                track.shapes[frame] = (f'points="{_points((polygon + 0.5).tolist())}"', "")
+        for identity, points in polylines(road):
+            track = self._tracks.setdefault((_LINE, identity), _Track(_LINE, "polyline"))
+            track.shapes[frame] = (f'points="{_points(points)}"', "")
         boxes = perception.boxes
         for index in range(0 if boxes is None else len(boxes)):
             assert boxes is not None

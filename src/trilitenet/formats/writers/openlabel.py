@@ -1,7 +1,8 @@
 """ASAM OpenLABEL 1.0: one JSON a picture or video, objects by identity and what is known of them by frame.
 
 Standard: https://www.asam.net/standards/detail/openlabel/. Boxes are ``bbox`` (centre x, centre y, width, height in
-pixels), the two masks are ``image`` (PNG in base64, 255 = inside), and their objects have the uids 0 and 1.
+pixels), the two masks are ``image`` (PNG in base64, 255 = inside) of the objects 0 and 1, lines of lanes are
+``poly2d``, and the road's figures are numbers of the context 0.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.formats.writers.base import JsonStream, Writer, dumps, rounded
+from trilitenet.formats.writers.base import JsonStream, Writer, dumps, polylines, rounded
 from trilitenet.processing.boxes import xyxy_to_cxcywh
 from trilitenet.structures import Perception
 
@@ -46,7 +47,7 @@ class OpenLabelWriter(Writer):
             self.close()
             path = self.create(f"{self.stem(perception)}.openlabel.json")
             self._document = document = _Document(path, perception.source)
-        document.add(perception)
+        document.add(perception, road)
 
     def close(self) -> None:
         """Finish the file of the last picture or video."""
@@ -66,10 +67,11 @@ class _Document:
         self._objects: dict[str, dict[str, str]] = {}
         self._seen: dict[str, list[int]] = {}
         self._frames: list[int] = []
-        self._uids: dict[int, str] = {}
+        self._uids: dict[tuple[str, int], str] = {}
+        self._context: list[int] = []
         self._next = len(_MASKS)
 
-    def add(self, perception: Perception) -> None:
+    def add(self, perception: Perception, road: Mapping[str, Any] | None) -> None:
         frame = perception.frame or 0
         self._frames.append(frame)
         objects: dict[str, Any] = {}
@@ -81,14 +83,25 @@ class _Document:
         boxes = perception.boxes
         for index in range(0 if boxes is None else len(boxes)):
             assert boxes is not None
-            uid = self._uid(-1 if boxes.track_id is None else int(boxes.track_id[index]))
+            track_id = -1 if boxes.track_id is None else int(boxes.track_id[index])
+            uid = self._uid(("box", track_id) if track_id >= 0 else None)
             kind = perception.class_names[boxes.class_id[index]]
             self._register(uid, frame, f"{kind} {uid}", kind)
             confidence = {"name": "confidence", "val": round(float(boxes.confidence[index]), 4)}
             value = list(rounded(xyxy_to_cxcywh(boxes.xyxy[index])))
             box = {"name": "box", "val": value, "attributes": {"num": [confidence]}}
             objects[uid] = {"object_data": {"bbox": [box]}}
+        for identity, points in polylines(road):
+            uid = self._uid(("line", identity))
+            self._register(uid, frame, f"lane line {identity}", "lane line")
+            flat = [value for point in points for value in point]
+            line = {"name": "curve", "val": flat, "mode": "MODE_POLY2D_ABSOLUTE", "closed": False}
+            objects[uid] = {"object_data": {"poly2d": [line]}}
         content: dict[str, Any] = {"objects": objects}
+        figures = _figures(road)
+        if figures:
+            content["contexts"] = {"0": {"context_data": {"num": figures}}}
+            self._context.append(frame)
         if perception.timestamp is not None:
             content["frame_properties"] = {"timestamp": round(perception.timestamp, 6)}
         self.stream.add(content, key=str(frame))
@@ -97,17 +110,21 @@ class _Document:
         objects = {
             uid: {**named, "frame_intervals": _intervals(self._seen[uid])} for uid, named in self._objects.items()
         }
-        intervals = dumps(_intervals(self._frames))
-        self.stream.close(f'}},\n"objects": {dumps(objects)},\n"frame_intervals": {intervals}}}}}')
+        tail: dict[str, Any] = {"objects": objects}
+        if self._context:
+            context = {"name": "road", "type": "road", "frame_intervals": _intervals(self._context)}
+            tail["contexts"] = {"0": context}
+        tail["frame_intervals"] = _intervals(self._frames)
+        self.stream.close("},\n" + ",\n".join(f"{dumps(key)}: {dumps(value)}" for key, value in tail.items()) + "}}")
 
-    def _uid(self, track_id: int) -> str:
-        """Return the uid of a track, or a new one for a box without identity."""
-        if track_id in self._uids:
-            return self._uids[track_id]
+    def _uid(self, key: tuple[str, int] | None) -> str:
+        """Return the uid of what has an identity over the frames, or a new one."""
+        if key is not None and key in self._uids:
+            return self._uids[key]
         uid = str(self._next)
         self._next += 1
-        if track_id >= 0:
-            self._uids[track_id] = uid
+        if key is not None:
+            self._uids[key] = uid
         return uid
 
     def _register(self, uid: str, frame: int, name: str, kind: str) -> None:
@@ -119,6 +136,21 @@ def _image(name: str, mask: NDArray[np.bool_]) -> dict[str, str]:
     _, encoded = cv2.imencode(".png", mask.astype(np.uint8) * 255, [cv2.IMWRITE_PNG_BILEVEL, 1])
     value = base64.b64encode(encoded.tobytes()).decode("ascii")
     return {"name": name, "val": value, "mime_type": "image/png", "encoding": "base64"}
+
+
+def _figures(road: Mapping[str, Any] | None) -> list[dict[str, Any]]:
+    """Return the road's estimates, each with its error as an attribute; those not known are left out."""
+    parts = {} if road is None else {"lane": road["ego_lane"] or {}, "lead": road["lead"] or {}}
+    return [
+        {
+            "name": f"{part}_{name}",
+            "val": estimate["value"],
+            "attributes": {"num": [{"name": "error", "val": estimate["error"]}]},
+        }
+        for part, estimates in parts.items()
+        for name, estimate in estimates.items()
+        if isinstance(estimate, Mapping)
+    ]
 
 
 def _intervals(frames: list[int]) -> list[dict[str, int]]:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from trilitenet.formats.writers.base import JsonStream, Writer, dumps, rounded
+from trilitenet.formats.writers.base import JsonStream, Writer, dumps, polylines, rounded
 from trilitenet.processing.serialise import encode_mask
 from trilitenet.structures import Perception
 
@@ -17,7 +17,7 @@ __all__ = ["ScalabelWriter"]
 
 
 class ScalabelWriter(Writer):
-    """Writes ``scalabel.json``: frames with boxes, and drivable area and lane markings as run-length masks.
+    """Writes ``scalabel.json``: boxes, drivable area and lane markings as masks, lines of lanes as polylines.
 
     Args:
         output: The folder.
@@ -39,7 +39,7 @@ class ScalabelWriter(Writer):
             "name": self.image_name(perception),
             "url": perception.source,
             "size": {"width": width, "height": height},
-            "labels": [*self._boxes(perception), *self._masks(perception)],
+            "labels": [*self._boxes(perception), *self._masks(perception), *self._lines(road)],
         }
         if perception.frame is not None:
             frame |= {"videoName": self.stem(perception), "frameIndex": perception.frame}
@@ -55,6 +55,7 @@ class ScalabelWriter(Writer):
             *({"name": name, "isThing": True} for name in self._class_names),
             {"name": "drivable", "isThing": False},
             {"name": "lane", "isThing": False},
+            {"name": "lane line", "isThing": True},
         ]
         self._stream.close(f'],\n"groups": null,\n"config": {dumps({"categories": categories})}}}')
         self.finish(self._stream.partial, self._stream.path)
@@ -90,6 +91,18 @@ class ScalabelWriter(Writer):
             }
             for category, mask in (("drivable", perception.drivable), ("lane", perception.lane))
             if mask is not None and mask.any()
+        ]
+
+    def _lines(self, road: Mapping[str, Any] | None) -> list[dict[str, Any]]:
+        return [
+            {
+                "id": f"line-{identity}",
+                "category": "lane line",
+                "manualShape": False,
+                "manualAttributes": False,
+                "poly2d": [{"vertices": points, "types": "L" * len(points), "closed": False}],
+            }
+            for identity, points in polylines(road)
         ]
 
     def _identity(self) -> str:

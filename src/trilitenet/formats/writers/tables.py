@@ -26,8 +26,17 @@ FRAME_COLUMNS: Final[dict[str, type]] = {
     "objects": int,
     "drivable_share": float,
     "lane_share": float,
+    "lines": int,
+    "lane_width": float,
+    "lane_offset": float,
+    "lane_heading": float,
+    "lane_curvature": float,
+    "lead_distance": float,
+    "lead_closing_speed": float,
+    "lead_time_to_collision": float,
+    "events": str,
 }
-"""Columns of a row a frame."""
+"""Columns of a row a frame: metres, radians, 1/m, m/s and seconds, as the road's JSON form describes them."""
 BOX_COLUMNS: Final[dict[str, type]] = {
     **_WHERE,
     "class_name": str,
@@ -44,9 +53,12 @@ BOX_COLUMNS: Final[dict[str, type]] = {
 def frame_row(perception: Perception, road: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Return the figures of one frame that have a single value; None where there is none.
 
-    ``drivable_share`` and ``lane_share`` are the masks' shares of the image's pixels.
+    ``drivable_share`` and ``lane_share`` are the masks' shares of the image's pixels; of the road's estimates only the
+    values are here, not their errors.
     """
     height, width = perception.size
+    road = road or {}
+    lane, lead = road.get("ego_lane") or {}, road.get("lead") or {}
     return {
         "source": perception.source,
         "frame": perception.frame,
@@ -56,7 +68,15 @@ def frame_row(perception: Perception, road: Mapping[str, Any] | None = None) -> 
         "objects": None if perception.boxes is None else len(perception.boxes),
         "drivable_share": None if perception.drivable is None else round(float(perception.drivable.mean()), 6),
         "lane_share": None if perception.lane is None else round(float(perception.lane.mean()), 6),
+        "lines": len(road["lines"]) if "lines" in road else None,
+        **{f"lane_{name}": _value(lane.get(name)) for name in ("width", "offset", "heading", "curvature")},
+        **{f"lead_{name}": _value(lead.get(name)) for name in ("distance", "closing_speed", "time_to_collision")},
+        "events": " ".join(f"{event['kind']}:{event['phase']}" for event in road.get("events", ())) or None,
     }
+
+
+def _value(estimate: Mapping[str, float] | None) -> float | None:
+    return None if estimate is None else estimate["value"]
 
 
 def box_rows(perception: Perception) -> list[dict[str, Any]]:
