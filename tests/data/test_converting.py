@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.data import raw_bdd
+from tests.formats.readers import raw_bdd
 from trilitenet.data.converting import ConversionOptions, convert
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.records import ImageRecord
 from trilitenet.errors import ConfigError, DataError, OutputError
-from trilitenet.formats.scalabel import BddSource, read_bdd100k
+from trilitenet.formats.readers.bdd100k import BddSource, read_bdd100k
 
 Tree = dict[str, tuple[bytes, int]]
 

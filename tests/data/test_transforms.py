@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -75,6 +76,11 @@ def check_together(sample: Sample, tolerance: float = 2.0) -> bool:
     return True
 
 
+def certainly(name: str, **others: Any) -> Augmentation:
+    """One step with probability 1."""
+    return Augmentation(**{name: 1.0, **others})
+
+
 ONLY: dict[str, Augmentation] = {
     "nothing": Augmentation(0, 0, 0, 0, 0, 0, 0),
     "rotation": Augmentation(10, 0, 0, 0, 0, 0, 0),
@@ -84,10 +90,7 @@ ONLY: dict[str, Augmentation] = {
     "colour": Augmentation(0, 0, 0, 0.015, 0.3, 0.3, 0),
     "published": Augmentation(hue=0.015, saturation=0.3, value=0.3),
     "half a pixel": Augmentation(mask_above=127, saturation=0.3, value=0.3),
-    **{
-        name: dataclasses.replace(Augmentation(saturation=0.1, value=0.1), **{name: 1.0})
-        for name in ("light", "blur", "noise", "rain")
-    },
+    **{name: certainly(name, saturation=0.1, value=0.1) for name in ("light", "blur", "noise", "rain")},
 }
 
 
@@ -109,9 +112,7 @@ def test_a_marked_place_moves_with_its_box_and_masks(name: str, size: tuple[int,
 def test_weather_that_hides_colours_moves_nothing(name: str) -> None:
     sample = marked()
     plain = TrainTransform(CANVAS, Augmentation())(sample, np.random.default_rng(5))
-    weather = TrainTransform(CANVAS, dataclasses.replace(Augmentation(), **{name: 1.0}))(
-        sample, np.random.default_rng(5)
-    )
+    weather = TrainTransform(CANVAS, certainly(name))(sample, np.random.default_rng(5))
     assert plain.boxes is not None
     assert weather.boxes is not None
     np.testing.assert_array_equal(plain.boxes, weather.boxes)

@@ -28,6 +28,7 @@ from PIL import Image, UnidentifiedImageError
 
 from trilitenet.data.description import (
     DESCRIPTION_FILE,
+    VEHICLES,
     DatasetDescription,
     MaskMeaning,
     class_table,
@@ -37,7 +38,7 @@ from trilitenet.data.description import (
 from trilitenet.data.lane_edges import centre_line, pair_edges
 from trilitenet.data.rasterise import draw_line, fill_polygon
 from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, IMAGE_FOLDER, LANE_FOLDER
-from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel, RecordSource
+from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel, RecordSource, RunLabel
 from trilitenet.errors import ConfigError, DataError, OutputError
 
 __all__ = ["ConversionOptions", "ConversionReport", "convert", "drivable_mask", "lane_mask"]
@@ -73,9 +74,7 @@ class ConversionOptions:
         images: Hard-link images (copied where that is impossible), copy them, or point symbolic links at them.
     """
 
-    classes: dict[str, tuple[str, ...]] = dataclasses.field(
-        default_factory=lambda: {"vehicle": ("car", "truck", "bus", "train")}
-    )
+    classes: dict[str, tuple[str, ...]] = dataclasses.field(default_factory=lambda: {"vehicle": VEHICLES})
     ignore: tuple[str, ...] = ()
     lane_width: dict[str, float] = dataclasses.field(default_factory=lambda: {"train": 8.0, "*": 2.0})
     crosswalk: bool = False
@@ -182,7 +181,7 @@ def convert(
 
 
 def drivable_mask(
-    areas: Iterable[AreaLabel], size: tuple[int, int], *, keep_alternative: bool = False
+    areas: Iterable[AreaLabel | RunLabel], size: tuple[int, int], *, keep_alternative: bool = False
 ) -> NDArray[np.uint8]:
     """Draw drivable areas, later ones over earlier ones.
 
@@ -196,13 +195,23 @@ def drivable_mask(
     """
     mask = np.zeros(size, np.uint8)
     for area in areas:
-        alternative = keep_alternative and area.kind == "alternative"
-        fill_polygon(mask, area.points, ALTERNATIVE_VALUE if alternative else 255)
+        level = _level(area.kind, keep_alternative=keep_alternative)
+        if isinstance(area, AreaLabel):
+            fill_polygon(mask, area.points, level)
+        else:
+            mask[area.decode(size)] = level
     return mask
 
 
+def _level(kind: str, *, keep_alternative: bool) -> int:
+    """Return the mask value of a kind of area."""
+    if kind == "ignore":
+        return IGNORE_VALUE
+    return ALTERNATIVE_VALUE if kind == "alternative" and keep_alternative else 255
+
+
 def lane_mask(
-    lanes: Iterable[LaneLabel], size: tuple[int, int], width: float, options: ConversionOptions
+    lanes: Iterable[LaneLabel | RunLabel], size: tuple[int, int], width: float, options: ConversionOptions
 ) -> tuple[NDArray[np.uint8], Counter[str], Counter[str]]:
     """Draw lane markings; the two edges of one become its centre line.
 
@@ -222,7 +231,10 @@ def lane_mask(
     factor = size[1] / REFERENCE_WIDTH
     groups: dict[tuple[str, str, str], list[NDArray[np.float64]]] = collections.defaultdict(list)
     for lane in lanes:
-        if lane.category == "crosswalk" and not options.crosswalk:
+        if not isinstance(lane, LaneLabel):
+            mask[lane.decode(size)] = _level(lane.kind, keep_alternative=False)
+            drawn["outlines"] += 1
+        elif lane.category == "crosswalk" and not options.crosswalk:
             dropped["lane: crosswalk"] += 1
         elif lane.direction == "vertical" and not options.vertical:
             dropped["lane: across the road"] += 1
@@ -322,8 +334,7 @@ def _convert_one(record: ImageRecord, split: str, root: Path, options: Conversio
             summary["lanes"] = dict(sorted(drawn.items()))
         _write_mask(root / LANE_FOLDER / split / f"{record.name}.png", mask)
         summary["labelled"].append("lane")
-    masks = (record.drivable, record.lane)
-    if any(isinstance(mask, MaskFile) and "ignore" in mask.values.values() for mask in masks):
+    if _has_ignored(record.drivable) or _has_ignored(record.lane):
         summary["ignore_value"] = True
     summary["dropped"] = dict(sorted(dropped.items()))
     # The image comes last: where it is, its labels are complete.
@@ -365,6 +376,12 @@ def _objects(
     return items, counts
 
 
+def _has_ignored(labels: tuple[AreaLabel | LaneLabel | RunLabel, ...] | MaskFile | None) -> bool:
+    if isinstance(labels, MaskFile):
+        return "ignore" in labels.values.values()
+    return any(getattr(label, "kind", "") == "ignore" for label in labels or ())
+
+
 def _mask_of(file: MaskFile, size: tuple[int, int], *, keep_alternative: bool) -> NDArray[np.uint8]:
     """Return the mask that a picture holds: 255 foreground, 127 alternative if kept apart, 64 ignored."""
     try:
@@ -384,10 +401,7 @@ def _mask_of(file: MaskFile, size: tuple[int, int], *, keep_alternative: bool) -
     mask = np.zeros(size, np.uint8)
     for value, meaning in file.values.items():
         code = (value[0] << 16) | (value[1] << 8) | value[2] if isinstance(value, tuple) else value
-        if meaning == "ignore":
-            level = IGNORE_VALUE
-        else:
-            level = ALTERNATIVE_VALUE if meaning == "alternative" and keep_alternative else 255
+        level = _level(meaning, keep_alternative=keep_alternative)
         mask[pixels == code] = level
     return mask
 

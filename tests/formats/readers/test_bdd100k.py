@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.data import raw_bdd
+from tests.formats.readers import raw_bdd
 from trilitenet.data.converting import ConversionOptions, convert
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.errors import DataError
-from trilitenet.formats.scalabel import parse_labels, read_bdd100k
+from trilitenet.formats.readers.bdd100k import parse_labels, read_bdd100k
 
 OPTIONS = ConversionOptions(lane_width={"*": raw_bdd.WIDTH_AT_1280}, max_gap=100.0)
 
@@ -119,7 +119,7 @@ def test_index_of_a_large_file_survives_chunk_borders(tmp_path: Path, monkeypatc
     raw_bdd.write_images(raw)
     raw_bdd.write_2018_merged(raw)
     whole = read_bdd100k(raw).record("train", "a1")
-    monkeypatch.setattr("trilitenet.formats.scalabel._CHUNK", 61)
+    monkeypatch.setattr("trilitenet.formats.readers.bdd100k._CHUNK", 61)
     pieces = read_bdd100k(raw).record("train", "a1")
     assert pieces.objects == whole.objects
 

@@ -1,0 +1,1 @@
+"""Readers of foreign data sets: one file a format, each giving image records for the conversion."""

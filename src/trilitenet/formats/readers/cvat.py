@@ -1,0 +1,146 @@
+"""CVAT's XML of the kind *CVAT for images 1.1*: boxes, polygons, polylines and masks.
+
+Format: https://docs.cvat.ai/docs/dataset_management/formats/format-cvat/. An image's ``subset`` is its split; the
+attributes of an image's tags become the image's.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ListedRecords, ObjectLabel, RowRuns
+from trilitenet.errors import DataError
+from trilitenet.formats.readers.mapping import LabelMapping, Shapes, find_image
+
+__all__ = ["read_cvat"]
+
+_SPLITS = {"train": "train", "training": "train", "val": "val", "validation": "val", "valid": "val", "test": "test"}
+_SHAPES = {"box", "polygon", "polyline", "mask", "points", "ellipse", "cuboid", "skeleton", "tag"}
+
+
+def read_cvat(root: str | Path, mapping: LabelMapping | None = None) -> ListedRecords:
+    """Read a data set exported from CVAT.
+
+    Args:
+        root: The folder with ``annotations.xml`` (or any ``.xml`` of this kind) and the images, or the file.
+        mapping: What the labels mean.
+
+    Raises:
+        DataError: If there is no such file, a broken one, or one of videos.
+    """
+    mapping = mapping or LabelMapping()
+    root = Path(root)
+    files = [root] if root.is_file() else sorted(root.glob("*.xml"))
+    if not files:
+        raise DataError(f"{root}: no .xml file; export the task from CVAT as 'CVAT for images 1.1'")
+    folder = root.parent if root.is_file() else root
+    records: dict[str, list[ImageRecord]] = defaultdict(list)
+    missing = 0
+    for path in files:
+        missing += _read_file(path, folder, mapping, records)
+    if not any(records.values()):
+        raise DataError(f"{root}: none of the images that the .xml lists is there; put them beside it or in images/")
+    found = [f"{split}: {len(items)} images" for split, items in records.items()]
+    if missing:
+        found.append(f"{missing} listed images are not there")
+    return ListedRecords(records, tuple(found))
+
+
+def _read_file(path: Path, folder: Path, mapping: LabelMapping, records: dict[str, list[ImageRecord]]) -> int:
+    categories: set[str] = set()
+    images: list[ElementTree.Element] = []
+    try:
+        for _, element in ElementTree.iterparse(path):
+            if element.tag == "label" and element.find("name") is not None:
+                categories.add(element.findtext("name") or "")
+            elif element.tag == "track":
+                raise DataError(f"{path}: is of the kind 'CVAT for video'; export it as 'CVAT for images 1.1'")
+            elif element.tag == "image":
+                images.append(element)
+                categories |= {shape.get("label", "") for shape in element}
+    except ElementTree.ParseError as error:
+        raise DataError(f"{path}: not XML ({error})") from error
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    tasks = mapping.labelled(categories)
+    missing = 0
+    for element in images:
+        name = element.get("name", "")
+        subset = (element.get("subset") or "").lower()
+        split = _SPLITS.get(subset, subset or mapping.split)
+        place = find_image(
+            name, [folder, folder / "images", folder / split, folder / "images" / split, folder / "data"]
+        )
+        if place is None:
+            missing += 1
+            continue
+        try:
+            objects, shapes, attributes, dropped = _read_image(element, mapping)
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(f"{path}: image {name!r} is not as CVAT has it ({error!r})") from error
+        records[split].append(
+            ImageRecord(
+                name=place.stem,
+                image=place,
+                objects=tuple(objects) if "detection" in tasks else None,
+                drivable=tuple(shapes.areas) if "drivable" in tasks else None,
+                lane=tuple(shapes.lanes) if "lane" in tasks else None,
+                attributes=attributes,
+                dropped=dict(dropped),
+            )
+        )
+    return missing
+
+
+def _read_image(
+    element: ElementTree.Element, mapping: LabelMapping
+) -> tuple[list[ObjectLabel], Shapes, dict[str, str], Counter[str]]:
+    objects: list[ObjectLabel] = []
+    shapes = Shapes()
+    attributes: dict[str, str] = {}
+    dropped: Counter[str] = Counter()
+    for shape in sorted(element, key=lambda item: int(item.get("z_order") or 0)):
+        label = shape.get("label", "")
+        own = {item.get("name", ""): item.text or "" for item in shape.findall("attribute")}
+        kind = mapping.area_kind(label)
+        if shape.tag == "tag":
+            attributes |= own
+        elif shape.tag == "box":
+            x1, y1, x2, y2 = (float(shape.attrib[key]) for key in ("xtl", "ytl", "xbr", "ybr"))
+            crowd = own.get("crowd", "").lower() == "true"
+            objects.append(
+                ObjectLabel(label, (x1, y1, x2, y2), crowd, {**own, "occluded": shape.get("occluded") == "1"})
+            )
+        elif shape.tag in {"polygon", "polyline"}:
+            points = _points(shape.attrib["points"])
+            if label in mapping.lane:
+                closed = shape.tag == "polygon"
+                shapes.lanes.append(LaneLabel(label, points, closed=closed, edge=mapping.lane_edges and not closed))
+            elif kind is not None and shape.tag == "polygon":
+                shapes.areas.append(AreaLabel(kind, points))
+            else:
+                low, high = points.min(axis=0), points.max(axis=0)
+                objects.append(ObjectLabel(label, (float(low[0]), float(low[1]), float(high[0]), float(high[1]))))
+        elif shape.tag == "mask":
+            left, top, width, height = (int(shape.attrib[key]) for key in ("left", "top", "width", "height"))
+            lengths = tuple(int(run) for run in shape.attrib["rle"].split(","))
+            runs = RowRuns(kind or "direct", left, top, width, height, lengths)
+            if label in mapping.lane:
+                shapes.lanes.append(runs)
+            elif kind is not None:
+                shapes.areas.append(runs)
+            else:
+                corners = (float(left), float(top), float(left + width), float(top + height))
+                objects.append(ObjectLabel(label, corners))
+        elif shape.tag in _SHAPES:
+            dropped[f"shape of kind {shape.tag!r}"] += 1
+    return objects, shapes, attributes, dropped
+
+
+def _points(text: str) -> NDArray[np.float64]:
+    return np.array([[float(value) for value in pair.split(",")] for pair in text.split(";")], np.float64)

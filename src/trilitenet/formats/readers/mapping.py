@@ -1,0 +1,189 @@
+"""What the names and values in a foreign data set mean: read from a YAML file, or the defaults."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import yaml
+
+from trilitenet.config import Task, check_tasks, parse
+from trilitenet.data.description import VEHICLES
+from trilitenet.data.records import AreaLabel, LaneLabel, RunLabel
+from trilitenet.errors import ConfigError, DataError
+
+__all__ = ["LabelMapping", "MaskRule", "parse_colour", "read_mapping"]
+
+_KINDS: Final = ("direct", "alternative", "foreground", "ignore", "background")
+
+
+@dataclasses.dataclass(frozen=True)
+class MaskRule:
+    """Where mask pictures are and what their values mean (``--from masks``).
+
+    Attributes:
+        path: From the data set's root, with ``{split}`` and ``{name}``.
+        values: Value -> ``direct``, ``alternative``, ``foreground`` or ``ignore``. A value is a grey level or index
+            (``7``) or a colour (``"128, 64, 128"`` or ``"#804080"``). Empty: everything above 0 is foreground.
+    """
+
+    path: str
+    values: dict[str | int, str] = dataclasses.field(default_factory=dict)
+
+    def meanings(self) -> dict[int | tuple[int, int, int], str]:
+        """Return the values parsed.
+
+        Raises:
+            ConfigError: If one is neither a level nor a colour, levels and colours are mixed, or a kind is unknown.
+        """
+        parsed: dict[int | tuple[int, int, int], str] = {}
+        for value, kind in self.values.items():
+            if kind not in _KINDS:
+                raise ConfigError(f"mask value {value!r} means {kind!r}; known: {', '.join(_KINDS)}")
+            if kind != "background":
+                parsed[parse_colour(value)] = kind
+        if len({isinstance(value, tuple) for value in parsed}) > 1:
+            raise ConfigError("mask values are either all levels or all colours")
+        return parsed or dict.fromkeys(range(1, 256), "foreground")
+
+
+@dataclasses.dataclass(frozen=True)
+class LabelMapping:
+    """The meaning of a foreign data set's names.
+
+    Attributes:
+        classes: Class name -> categories that belong to it.
+        ignore: Categories that are neither object nor background; for areas too.
+        drivable: Categories of areas that are drivable.
+        alternative: Categories of areas that are drivable after a lane change.
+        lane: Categories of lane markings.
+        lane_edges: Lines come two a marking, its edges; they are paired. False: a line is a marking's middle.
+        tasks: What is labelled; found from the categories if left out.
+        missing: An image without a label file is ``unlabelled``, or ``empty``: looked at, and nothing there.
+        split: The split of images that the format does not put into one.
+        splits: ``--from masks``: the splits to look for.
+        images: ``--from masks``: folder of the images, with ``{split}``.
+        drivable_mask: ``--from masks``: the drivable masks.
+        lane_mask: ``--from masks``: the lane masks.
+        name: Of the data set.
+        licence: Of images and labels.
+    """
+
+    classes: dict[str, tuple[str, ...]] = dataclasses.field(default_factory=lambda: {"vehicle": VEHICLES})
+    ignore: tuple[str, ...] = ()
+    drivable: tuple[str, ...] = ("drivable", "drivable area", "direct")
+    alternative: tuple[str, ...] = ("alternative",)
+    lane: tuple[str, ...] = ("lane", "lane marking")
+    lane_edges: bool = False
+    tasks: tuple[Task, ...] = ()
+    missing: Literal["unlabelled", "empty"] = "unlabelled"
+    split: str = "train"
+    splits: tuple[str, ...] = ("train", "val", "test")
+    images: str = "images/{split}"
+    drivable_mask: MaskRule = MaskRule("drivable/{split}/{name}.png")
+    lane_mask: MaskRule = MaskRule("lane/{split}/{name}.png")
+    name: str = ""
+    licence: str = ""
+
+    def __post_init__(self) -> None:
+        if self.tasks:
+            check_tasks(self.tasks)
+
+    def area_kind(self, category: str) -> str | None:
+        """Return ``direct``, ``alternative`` or ``ignore`` if a category is an area, else None."""
+        if category in self.drivable:
+            return "direct"
+        if category in self.alternative:
+            return "alternative"
+        return "ignore" if category in self.ignore else None
+
+    def labelled(self, categories: set[str]) -> set[Task]:
+        """Return the tasks that a data set with these categories labels."""
+        if self.tasks:
+            return set(self.tasks)
+        tasks: set[Task] = set()
+        if any(category in categories for members in self.classes.values() for category in members):
+            tasks.add("detection")
+        if categories & {*self.drivable, *self.alternative}:
+            tasks.add("drivable")
+        if categories & set(self.lane):
+            tasks.add("lane")
+        return tasks
+
+
+@dataclasses.dataclass
+class Shapes:
+    """Gathers the areas and markings of one image while a reader goes through it."""
+
+    areas: list[AreaLabel | RunLabel] = dataclasses.field(default_factory=list)
+    lanes: list[LaneLabel | RunLabel] = dataclasses.field(default_factory=list)
+
+
+def read_mapping(path: str | Path | None) -> LabelMapping:
+    """Read a mapping from YAML; None gives the defaults.
+
+    Raises:
+        ConfigError: If it is not YAML, or has an unknown key or a wrong value.
+    """
+    if path is None:
+        return LabelMapping()
+    try:
+        content: Any = yaml.safe_load(Path(path).read_text(encoding="utf-8")) or {}
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not YAML ({' '.join(str(error).split())})") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: must be a mapping of keys")
+    mapping = parse(LabelMapping, content, str(path))
+    for rule in (mapping.drivable_mask, mapping.lane_mask):
+        rule.meanings()
+    return mapping
+
+
+def parse_colour(value: str | int) -> int | tuple[int, int, int]:
+    """Return a grey level, or (red, green, blue), from ``7``, ``"7"``, ``"128, 64, 128"`` or ``"#804080"``.
+
+    Raises:
+        ConfigError: If it is none of these.
+    """
+    text = str(value).strip()
+    if match := re.fullmatch(r"#([0-9a-fA-F]{2})([0-9a-fA-F]{2})([0-9a-fA-F]{2})", text):
+        return (int(match[1], 16), int(match[2], 16), int(match[3], 16))
+    parts = [part for part in re.split(r"[,\s]+", text.strip("()[]")) if part]
+    try:
+        numbers = [int(part) for part in parts]
+    except ValueError:
+        numbers = []
+    if len(numbers) == 1 and 0 <= numbers[0] < 65536:
+        return numbers[0]
+    if len(numbers) == 3 and all(0 <= number < 256 for number in numbers):
+        return (numbers[0], numbers[1], numbers[2])
+    raise ConfigError(f"mask value {value!r} is neither a level (7) nor a colour ('128, 64, 128' or '#804080')")
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        DataError: If it is missing or broken.
+    """
+    try:
+        return json.loads(path.read_bytes())
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise DataError(f"{path}: not JSON ({error})") from error
+
+
+def find_image(name: str, folders: list[Path]) -> Path | None:
+    """Return the first of the folders' files with that name, or with its last part."""
+    for candidate in (name, Path(name).name):
+        for folder in folders:
+            path = folder / candidate
+            if path.is_file():
+                return path
+    return None

@@ -1,0 +1,57 @@
+"""Plain mask pictures: an image, and beside it one picture a task whose values or colours a YAML file explains."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from trilitenet.data.reading import IMAGE_ENDINGS
+from trilitenet.data.records import ImageRecord, ListedRecords, MaskFile
+from trilitenet.errors import DataError
+from trilitenet.formats.readers.mapping import LabelMapping, MaskRule
+
+__all__ = ["read_masks"]
+
+
+def read_masks(root: str | Path, mapping: LabelMapping | None = None) -> ListedRecords:
+    """Read a data set of images and mask pictures.
+
+    Args:
+        root: The data set's folder.
+        mapping: Where images and masks are, and what the values mean; see `MaskRule`.
+
+    Raises:
+        DataError: If there are no images.
+        ConfigError: If the values are wrong.
+    """
+    mapping = mapping or LabelMapping()
+    root = Path(root)
+    records: dict[str, list[ImageRecord]] = {}
+    found = []
+    split_free = "{split}" not in mapping.images
+    for split in (mapping.split,) if split_free else mapping.splits:
+        folder = root / mapping.images.format(split=split)
+        if not folder.is_dir():
+            continue
+        items = [
+            ImageRecord(
+                name=path.stem,
+                image=path,
+                drivable=_mask(root, mapping.drivable_mask, split, path.stem),
+                lane=_mask(root, mapping.lane_mask, split, path.stem),
+            )
+            for path in sorted(folder.iterdir())
+            if path.suffix.lower() in IMAGE_ENDINGS
+        ]
+        if items:
+            records[split] = items
+            drivable = sum(item.drivable is not None for item in items)
+            lane = sum(item.lane is not None for item in items)
+            found.append(f"{split}: {len(items)} images, {drivable} drivable masks, {lane} lane masks")
+    if not records:
+        raise DataError(f"{root}: no images in {mapping.images!r} for the splits {', '.join(mapping.splits)}")
+    return ListedRecords(records, tuple(found))
+
+
+def _mask(root: Path, rule: MaskRule, split: str, name: str) -> MaskFile | None:
+    path = root / rule.path.format(split=split, name=name)
+    return MaskFile(path, rule.meanings()) if path.is_file() else None

@@ -1,0 +1,178 @@
+"""YOLO's label files: a text file an image, a line an object, and a ``data.yaml`` with names and folders.
+
+Format: https://docs.ultralytics.com/datasets/detect/ (``class cx cy w h``, all in [0, 1]; a sixth number is a
+confidence) and https://docs.ultralytics.com/datasets/segment/ (``class x1 y1 x2 y2 x3 y3 ...``).
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from PIL import Image, UnidentifiedImageError
+
+from trilitenet.config import Task
+from trilitenet.data.reading import IMAGE_ENDINGS
+from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ObjectLabel
+from trilitenet.errors import DataError
+from trilitenet.formats.readers.mapping import LabelMapping, Shapes
+
+__all__ = ["YoloSource", "read_yolo"]
+
+
+class YoloSource:
+    """A YOLO data set as a `RecordSource`; made by `read_yolo`.
+
+    Attributes:
+        found: One line for each split, for the user.
+    """
+
+    def __init__(
+        self, images: dict[str, dict[str, Path]], names: dict[int, str], mapping: LabelMapping, found: tuple[str, ...]
+    ) -> None:
+        self._images = images
+        self._names = names
+        self._mapping = mapping
+        self._tasks: set[Task] = mapping.labelled(set(names.values()))
+        self.found = found
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        """The splits there are."""
+        return tuple(self._images)
+
+    def names(self, split: str) -> list[str]:
+        """Return the names of a split's images, sorted."""
+        return sorted(self._images[split])
+
+    def record(self, split: str, name: str) -> ImageRecord:
+        """Read one image's labels.
+
+        Raises:
+            DataError: If the label file is broken.
+        """
+        image = self._images[split][name]
+        path = _label_path(image)
+        try:
+            text = path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            if self._mapping.missing == "unlabelled":
+                return ImageRecord(name, image)
+            text = ""
+        objects, shapes = self._parse(text, path, image)
+        return ImageRecord(
+            name=name,
+            image=image,
+            objects=tuple(objects) if "detection" in self._tasks else None,
+            drivable=tuple(shapes.areas) if "drivable" in self._tasks else None,
+            lane=tuple(shapes.lanes) if "lane" in self._tasks else None,
+        )
+
+    def _parse(self, text: str, path: Path, image: Path) -> tuple[list[ObjectLabel], Shapes]:
+        objects: list[ObjectLabel] = []
+        shapes = Shapes()
+        lines = [(number, line.split()) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+        size = _size(image) if lines else (0, 0)
+        scale = np.array([size[1], size[0]], np.float64)
+        for number, words in lines:
+            try:
+                category = self._names.get(int(float(words[0])), words[0])
+                values = np.array([float(word) for word in words[1:]])
+            except ValueError as error:
+                raise DataError(f"{path}, line {number}: not numbers ({error})") from error
+            if len(values) in (4, 5):
+                centre, extent = values[:2] * scale, values[2:4] * scale
+                x1, y1, x2, y2 = (float(v) for v in (*(centre - extent / 2), *(centre + extent / 2)))
+                objects.append(ObjectLabel(category, (x1, y1, x2, y2)))
+                continue
+            if len(values) < 6 or len(values) % 2:
+                raise DataError(f"{path}, line {number}: neither a box (4 numbers) nor a polygon (6 or more, even)")
+            points = values.reshape(-1, 2) * scale
+            kind = self._mapping.area_kind(category)
+            if category in self._mapping.lane:
+                shapes.lanes.append(LaneLabel(category, points, closed=True))
+            elif kind is not None:
+                shapes.areas.append(AreaLabel(kind, points))
+            else:
+                low, high = points.min(axis=0), points.max(axis=0)
+                objects.append(ObjectLabel(category, (float(low[0]), float(low[1]), float(high[0]), float(high[1]))))
+        return objects, shapes
+
+
+def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSource:
+    """Read a data set with YOLO labels.
+
+    Args:
+        root: The folder with ``data.yaml`` (or any one ``.yaml`` with ``names``), or that file.
+        mapping: What the class names mean.
+
+    Raises:
+        DataError: If there is no such file, or no images where it says.
+    """
+    mapping = mapping or LabelMapping()
+    path = _find_yaml(Path(root))
+    try:
+        content: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+        names = content["names"]
+        table = dict(enumerate(names)) if isinstance(names, list) else {int(key): value for key, value in names.items()}
+        base = path.parent / str(content.get("path") or ".")
+        if not base.is_dir():
+            base = path.parent
+    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise DataError(f"{path}: not a YOLO data file ({error!r})") from error
+    images: dict[str, dict[str, Path]] = defaultdict(dict)
+    for key, split in (("train", "train"), ("val", "val"), ("valid", "val"), ("test", "test")):
+        places = content.get(key)
+        if not places:
+            continue
+        for place in places if isinstance(places, list) else [places]:
+            for image in _images_at(base, path.parent, str(place)):
+                images[split][image.stem] = image
+    if content.get("train") == content.get("val"):
+        images.pop("val", None)
+    images = {split: items for split, items in images.items() if items}
+    if not images:
+        raise DataError(f"{path}: no images in the folders that it names")
+    found = tuple(f"{split}: {len(items)} images" for split, items in images.items())
+    return YoloSource(dict(images), {key: str(value) for key, value in table.items()}, mapping, found)
+
+
+def _find_yaml(root: Path) -> Path:
+    if root.is_file():
+        return root
+    for path in [root / "data.yaml", *sorted(root.glob("*.y*ml"))]:
+        if path.is_file() and "names" in path.read_text(encoding="utf-8"):
+            return path
+    raise DataError(f"{root}: no data.yaml with 'names'")
+
+
+def _images_at(base: Path, beside: Path, place: str) -> list[Path]:
+    for root in (base, beside):
+        folder = root / place
+        if folder.is_dir():
+            return sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_ENDINGS)
+        if folder.suffix == ".txt" and folder.is_file():
+            lines = folder.read_text(encoding="utf-8").split()
+            return [path for path in ((root / line) for line in lines) if path.is_file()]
+    return []
+
+
+def _label_path(image: Path) -> Path:
+    """Return the label file: ``labels`` instead of the last ``images`` in the path, else beside the image."""
+    parts = list(image.parts)
+    for index in range(len(parts) - 2, -1, -1):
+        if parts[index] == "images":
+            parts[index] = "labels"
+            break
+    return Path(*parts).with_suffix(".txt")
+
+
+def _size(path: Path) -> tuple[int, int]:
+    try:
+        with Image.open(path) as image:
+            return image.height, image.width
+    except (OSError, UnidentifiedImageError) as error:
+        raise DataError(f"{path}: not an image that can be read ({error})") from error

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.formats.readers.conftest import SIZE
+from trilitenet.data.converting import ConversionOptions, convert
+from trilitenet.data.reading import DrivingDataset
+from trilitenet.errors import DataError
+from trilitenet.formats.readers.cvat import read_cvat
+from trilitenet.formats.readers.mapping import LabelMapping
+from trilitenet.formats.writers.base import open_writer
+from trilitenet.structures import Perception
+
+CLASSES: dict[str, tuple[str, ...]] = {"car": ("car",), "truck": ("truck",)}
+
+
+def test_what_the_writer_writes_comes_back(perceptions: list[Perception], tmp_path: Path) -> None:
+    with open_writer("cvat", tmp_path / "data") as writer:
+        for perception in perceptions:
+            writer.write(perception)
+    source = read_cvat(tmp_path / "data", LabelMapping(classes=CLASSES))
+    convert(source, tmp_path / "out", ConversionOptions(classes=CLASSES))
+    dataset = DrivingDataset(tmp_path / "out", "train")
+    assert dataset.names == ["one", "two"]
+    for sample, perception in zip(dataset, perceptions, strict=True):
+        assert perception.boxes is not None
+        assert sample.boxes is not None
+        np.testing.assert_allclose(sample.boxes, perception.boxes.xyxy, atol=0.011)
+        np.testing.assert_array_equal(sample.class_id, perception.boxes.class_id)
+        np.testing.assert_array_equal(sample.drivable, perception.drivable)
+        np.testing.assert_array_equal(sample.lane, perception.lane)
+
+
+XML = """<?xml version="1.0" encoding="utf-8"?>
+<annotations>
+  <version>1.1</version>
+  <meta><task><labels><label><name>vehicle</name></label><label><name>lane</name></label>
+    <label><name>drivable</name></label></labels></task></meta>
+  <image id="0" name="clips/one.png" subset="Validation" width="80" height="48">
+    <box label="vehicle" occluded="1" xtl="1" ytl="2" xbr="5.5" ybr="7" z_order="0">
+      <attribute name="crowd">true</attribute></box>
+    <polygon label="drivable" points="10,20;30,20;30,40;10,40" z_order="0"></polygon>
+    <polyline label="lane" points="50,5;50,45" z_order="0"></polyline>
+    <polyline label="lane" points="54,45;54,5" z_order="0"></polyline>
+    <points label="vehicle" points="1,2"></points>
+    <tag label="scene"><attribute name="weather">rainy</attribute></tag>
+  </image>
+  <image id="1" name="gone.png" width="80" height="48"></image>
+</annotations>
+"""
+
+
+@pytest.mark.parametrize(("edges", "columns"), [(False, [49, 50, 53, 54]), (True, [51, 52])])
+def test_shapes(tmp_path: Path, edges: bool, columns: list[int]) -> None:
+    (tmp_path / "annotations.xml").write_text(XML)
+    cv2.imwrite(str(tmp_path / "one.png"), np.zeros((*SIZE, 3), np.uint8))
+    source = read_cvat(tmp_path, LabelMapping(lane_edges=edges))
+    assert source.found == ("val: 1 images", "1 listed images are not there")
+    options = ConversionOptions(lane_width={"*": 2 * 1280 / SIZE[1]}, max_gap=100)
+    report = convert(source, tmp_path / "out", options)
+    sample = DrivingDataset(tmp_path / "out", "val")[0]
+    assert sample.ignored.tolist() == [[1, 2, 5.5, 7]]
+    assert sample.boxes is not None
+    assert len(sample.boxes) == 0
+    assert sample.drivable is not None
+    assert sample.drivable.sum() == 400
+    assert sample.lane is not None
+    assert np.flatnonzero(sample.lane[25]).tolist() == columns
+    assert sample.attributes["weather"] == "rainy"
+    assert report.dropped["val"] == {"shape of kind 'points'": 1}
+
+
+def test_errors(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"no \.xml file"):
+        read_cvat(tmp_path)
+    path = tmp_path / "annotations.xml"
+    path.write_text("<annotations>")
+    with pytest.raises(DataError, match="not XML"):
+        read_cvat(tmp_path)
+    path.write_text('<annotations><track id="0" label="car"></track></annotations>')
+    with pytest.raises(DataError, match="CVAT for video"):
+        read_cvat(tmp_path)
+    path.write_text(XML)
+    with pytest.raises(DataError, match="none of the images"):
+        read_cvat(tmp_path)
+    cv2.imwrite(str(tmp_path / "one.png"), np.zeros((*SIZE, 3), np.uint8))
+    path.write_text(XML.replace('xtl="1"', 'xtl="x"'))
+    with pytest.raises(DataError, match="not as CVAT has it"):
+        read_cvat(tmp_path)
