@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 
-from trilitenet.config import LONG_SIDE, ModelCard, Thresholds
+from trilitenet.config import ModelCard, Thresholds
 from trilitenet.errors import ConfigError, did_you_mean
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.predictor import Predictor
@@ -25,7 +25,7 @@ def load(
     iou: float | None = None,
     drivable: float | None = None,
     lane: float | None = None,
-    long_side: int = LONG_SIDE,
+    long_side: int | None = None,
     batch_size: int = 8,
 ) -> Predictor:
     """Load a model as a predictor.
@@ -38,7 +38,7 @@ def load(
         iou: A box goes when it overlaps a better one by more, in [0, 1]; the model's own if left out.
         drivable: A pixel is drivable above this probability, in [0, 1]; the model's own if left out.
         lane: A pixel is lane marking above this probability, in [0, 1]; the model's own if left out.
-        long_side: The longer side of an image is resized to so many pixels.
+        long_side: The longer side of an image is resized to so many pixels; by default as in training.
         batch_size: At most so many images go through the network at once.
 
     Returns:

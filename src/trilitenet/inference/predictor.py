@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from trilitenet.config import LONG_SIDE, ModelCard, Thresholds
+from trilitenet.config import ModelCard, Thresholds
 from trilitenet.errors import ConfigError
 from trilitenet.inference.backend import Backend
 from trilitenet.processing.images import read_image
@@ -37,7 +37,8 @@ class Predictor:
     Args:
         backend: The network on a runtime.
         thresholds: What counts as an object, drivable or lane; the card's if left out.
-        long_side: The longer side of an image is resized to so many pixels, where the backend's input is not fixed.
+        long_side: The longer side of an image is resized to so many pixels, where the backend's input is not fixed;
+            by default that of the size the network was trained at (its card's ``input_size``).
         batch_size: At most so many images go through the network at once.
 
     Raises:
@@ -49,9 +50,10 @@ class Predictor:
         backend: Backend,
         thresholds: Thresholds | None = None,
         *,
-        long_side: int = LONG_SIDE,
+        long_side: int | None = None,
         batch_size: int = 8,
     ) -> None:
+        long_side = max(backend.card.input_size) if long_side is None else long_side
         if min(long_side, batch_size) < 1:
             raise ConfigError(f"long_side and batch_size must be at least 1, got {long_side} and {batch_size}")
         self.backend = backend
