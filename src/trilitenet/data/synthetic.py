@@ -263,7 +263,10 @@ def _objects(world: World, drawn: Rendering) -> tuple[ObjectTruth, ...]:
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         if not len(rows):
             continue
-        box = np.array([x0 + columns[0], y0 + rows[0], x0 + columns[-1] + 1, y0 + rows[-1] + 1], np.float32)
+        # An outline fills every pixel that it touches, so that it ends in the middle of the outermost ones, on average.
+        box = np.array([x0 + columns[0], y0 + rows[0], x0 + columns[-1], y0 + rows[-1]], np.float32) + np.float32(0.5)
+        box[:2][box[:2] < 1] = 0.0
+        box[2:] = np.where(box[2:] > (width - 1, height - 1), (width, height), box[2:])
         inside = (min(full[2], width) - max(full[0], 0)) * (min(full[3], height) - max(full[1], 0))
         visible = float(min(1.0, mask.sum() / max(inside * 0.8, 1.0)))
         hidden = visible < MIN_VISIBLE or lit < 0.12

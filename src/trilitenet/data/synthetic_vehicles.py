@@ -376,7 +376,7 @@ def draw_vehicle(
             if at == side and sides_seen:
                 continue
             x = axle - radius * 0.9 if rear_seen else axle + radius * 0.9
-            pen.polygon(_across(x, y - at * 0.24, y, 0.0, radius * 1.5), _RUBBER)
+            pen.polygon(_across(x, y - at * 0.24, y, radius * 0.56, radius * 1.5), _RUBBER)
             pen.polygon(_across(axle, y - at * 0.24, y, 0.0, radius * 1.5), _RUBBER)
     order = sorted(shape.parts, key=lambda part: -abs(float(np.mean([x for x, _ in part.outline])) - eye[0]))
     for part in order:

@@ -74,7 +74,7 @@ class LaneLine:
         id: Identity over the frames of a video; an index for a still picture.
         position: -1 is the first line left of the vehicle, -2 the next; 1 the first to the right; 0 = unknown.
         points: (N, 2) float32 u, v on the curve in pixels, from near (bottom) to far.
-        polynomial: (4,) float64: u = p0 + p1 t + p2 t^2 + p3 t^3 with t = (v - v0) / span.
+        polynomial: (6,) float64: u = p0 + p1 t + ... + p5 t^5 with t = (v - v0) / span.
         origin: (v0, span): t is 0 at the nearest row and 1 at the farthest.
         residual: Root mean square distance in u of the mask's middle from the curve, in pixels.
         confidence: In [0, 1]: how much of the curve the mask covers, how long it is and how well it fits.
@@ -95,9 +95,9 @@ class LaneLine:
         v0, span = self.origin
         t = (np.asarray(row, np.float64) - v0) / span
         inside = np.clip(t, 0.0, 1.0)
-        p0, p1, p2, p3 = self.polynomial
-        value = p0 + inside * (p1 + inside * (p2 + inside * p3))
-        slope = p1 + inside * (2 * p2 + inside * 3 * p3)
+        p0, p1, p2, p3, p4, p5 = self.polynomial.tolist()
+        value = p0 + inside * (p1 + inside * (p2 + inside * (p3 + inside * (p4 + inside * p5))))
+        slope = p1 + inside * (2 * p2 + inside * (3 * p3 + inside * (4 * p4 + inside * 5 * p5)))
         return value + (t - inside) * slope
 
     def to_dict(self) -> dict[str, Any]:

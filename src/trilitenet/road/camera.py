@@ -1,0 +1,266 @@
+"""Where the camera comes from: a YAML file, or the lanes themselves; and the picture it gives from above."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from trilitenet.config import parse
+from trilitenet.errors import ConfigError, OutputError
+from trilitenet.processing.geometry import Camera
+from trilitenet.road.lanes import vanishing_point
+from trilitenet.road.structures import LaneLine
+
+__all__ = ["CameraErrors", "SelfCalibration", "View", "birds_eye", "read_camera", "write_camera"]
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraErrors:
+    """How well a camera is known: one standard deviation each.
+
+    Attributes:
+        pitch: Radians.
+        yaw: Radians.
+        height: Share of the height.
+        focal: Share of the focal length.
+    """
+
+    pitch: float = 0.002
+    yaw: float = 0.002
+    height: float = 0.01
+    focal: float = 0.005
+
+
+@dataclasses.dataclass(frozen=True)
+class _Matrix:
+    data: tuple[float, ...]
+    rows: int = 0
+    cols: int = 0
+    dt: str = "d"
+
+
+@dataclasses.dataclass(frozen=True)
+class _CameraFile:
+    image_width: int
+    image_height: int
+    height: float
+    camera_matrix: _Matrix | None = None
+    distortion_coefficients: _Matrix | None = None
+    field_of_view: float | None = None
+    pitch: float = 0.0
+    yaw: float = 0.0
+    roll: float = 0.0
+    camera_name: str = ""
+
+
+def read_camera(path: str | Path) -> Camera:
+    """Read a camera from YAML.
+
+    The intrinsics are as OpenCV and ROS write them (``image_width``, ``image_height``, ``camera_matrix`` and
+    ``distortion_coefficients`` with their ``data``), or ``field_of_view`` in degrees for an ideal lens. To these come
+    the mounting: ``height`` in metres, and ``pitch`` (down), ``yaw`` (left), ``roll`` (right side lowered) in degrees.
+
+    Raises:
+        ConfigError: If the file is missing or not YAML, has an unknown key, lacks one, or a value is out of range.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read as a camera file ({error})") from error
+    # OpenCV's FileStorage writes a directive and a tag that are no standard YAML.
+    text = re.sub(r"\A%YAML.*\n", "", text).replace("!!opencv-matrix", "")
+    try:
+        content: Any = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: not YAML ({' '.join(str(error).split())})") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: must be a mapping of keys such as image_width, camera_matrix and height")
+    for key in ("camera_matrix", "distortion_coefficients"):
+        if isinstance(content.get(key), list):
+            content[key] = {"data": np.ravel(content[key]).tolist()}
+    file = parse(_CameraFile, content, str(path))
+    size = (file.image_height, file.image_width)
+    pitch, yaw, roll = (math.radians(angle) for angle in (file.pitch, file.yaw, file.roll))
+    try:
+        if file.camera_matrix is None:
+            if file.field_of_view is None:
+                raise ConfigError("needs camera_matrix, or field_of_view in degrees")
+            return Camera.from_field_of_view(size, file.field_of_view, file.height, pitch=pitch, yaw=yaw, roll=roll)
+        if file.field_of_view is not None:
+            raise ConfigError("camera_matrix and field_of_view exclude each other")
+        matrix = file.camera_matrix.data
+        if len(matrix) != 9:
+            raise ConfigError(f"camera_matrix must have 9 numbers, got {len(matrix)}")
+        lens = () if file.distortion_coefficients is None else file.distortion_coefficients.data
+        return Camera(
+            size, matrix[0], matrix[4], matrix[2], matrix[5], file.height, pitch, yaw, roll,
+            lens if any(lens) else (),
+        )  # fmt: skip
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def write_camera(camera: Camera, path: str | Path) -> None:
+    """Write a camera as `read_camera` reads it.
+
+    Raises:
+        OutputError: If the file cannot be written.
+    """
+    content = {
+        "image_width": camera.size[1],
+        "image_height": camera.size[0],
+        "camera_matrix": {"rows": 3, "cols": 3, "data": [float(v) for v in camera.matrix.ravel()]},
+        "distortion_coefficients": {"rows": 1, "cols": len(camera.distortion), "data": list(camera.distortion)},
+        "height": camera.height,
+        **{name: math.degrees(getattr(camera, name)) for name in ("pitch", "yaw", "roll")},
+    }
+    try:
+        Path(path).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error})") from error
+
+
+class SelfCalibration:
+    """Estimates how the camera is mounted from the lanes alone: pitch and yaw from where they vanish, height from the
+    width of a lane. It trusts itself once enough frames agree.
+
+    The focal length cannot be seen from lanes: it follows from the assumed field of view, and its uncertainty goes into
+    every distance. Offsets across the lane do not depend on it.
+
+    Args:
+        size: (height, width) of the pictures in pixels.
+        field_of_view: Horizontal, in degrees.
+        lane_width: Metres between the middles of a lane's two lines.
+        still: A single picture is all there will be: one good vanishing point is enough.
+    """
+
+    WINDOW: Final = 250
+    """Frames that are remembered."""
+    NEEDED: Final = 12
+    """Frames with a vanishing point before it is trusted."""
+    FOCAL_ERROR: Final = 0.15
+    """Standard deviation of the assumed focal length, as a share."""
+    WIDTH_ERROR: Final = 0.06
+    """Standard deviation of the assumed lane width, as a share."""
+
+    def __init__(
+        self, size: tuple[int, int], *, field_of_view: float = 60.0, lane_width: float = 3.5, still: bool = False
+    ) -> None:
+        if not lane_width > 0:
+            raise ConfigError(f"lane width must be positive, got {lane_width}")
+        self.size, self.lane_width, self.still = size, lane_width, still
+        self._level = Camera.from_field_of_view(size, field_of_view, 1.0)
+        self._points: deque[tuple[float, float, float]] = deque(maxlen=self.WINDOW)
+        self._spreads: deque[float] = deque(maxlen=self.WINDOW)
+        self.camera: Camera | None = None
+        self.errors = CameraErrors()
+
+    def update(self, lines: Sequence[LaneLine]) -> None:
+        """Take in the lines of one frame, with their positions (see `assign_positions`) where known."""
+        found = vanishing_point(lines, self.size)
+        height = self.size[0]
+        if found is None or found.error > 0.03 * height or not 0.1 * height < found.v < 0.75 * height:
+            return
+        self._points.append((found.u, found.v, found.error))
+        left = next((line for line in lines if line.position == -1), None)
+        right = next((line for line in lines if line.position == 1), None)
+        if left is not None and right is not None:
+            low = min(left.origin[0], right.origin[0])
+            if low - found.v > 0.2 * height:
+                # The width of a lane in pixels grows in proportion to the distance below the horizon.
+                self._spreads.append(float(right.column(low) - left.column(low)) / (low - found.v))
+        self._solve()
+
+    def _solve(self) -> None:
+        points = np.array(self._points)
+        needed = 1 if self.still else self.NEEDED
+        if len(points) < needed or not self._spreads:
+            self.camera = None
+            return
+        u, v = np.median(points[:, 0]), np.median(points[:, 1])
+        count = len(points)
+        scatter = 1.48 * np.median(np.abs(points[:, :2] - (u, v)), axis=0) / math.sqrt(max(count / 5, 1.0))
+        row_error = math.hypot(float(scatter[1]), float(np.median(points[:, 2])) / math.sqrt(count))
+        focal = self._level.fy
+        pitch = math.atan((self._level.cy - v) / focal)
+        yaw = math.atan((u - self._level.cx) * math.cos(pitch) / focal)
+        pitch_error = row_error / focal + 0.1 * self.FOCAL_ERROR * abs(pitch)
+        if pitch_error > 0.02:
+            self.camera = None
+            return
+        spread = float(np.median(self._spreads))
+        # Pixels across a lane, a row below the horizon, are width / height of the camera (for square pixels).
+        mounted = self.lane_width * math.cos(pitch) / spread if spread > 0 else math.nan
+        if not 0.5 < mounted < 4.5:
+            self.camera = None
+            return
+        self.camera = dataclasses.replace(self._level, height=mounted, pitch=pitch, yaw=yaw)
+        yaw_error = float(scatter[0]) / focal + (0.02 if self.still else 0.003)
+        self.errors = CameraErrors(pitch_error, yaw_error, self.WIDTH_ERROR, self.FOCAL_ERROR)
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """What a picture from above shows.
+
+    Attributes:
+        near: Metres ahead at its lower edge.
+        far: Metres ahead at its upper edge.
+        half_width: Metres to either side.
+        scale: Pixels a metre.
+    """
+
+    near: float = 3.0
+    far: float = 50.0
+    half_width: float = 9.0
+    scale: float = 8.0
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        return round((self.far - self.near) * self.scale), round(2 * self.half_width * self.scale)
+
+    def to_pixels(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (N, 2) pixels u, v of the picture from above, of (N, 2) points x, y in metres."""
+        u = (self.half_width - points[:, 1]) * self.scale - 0.5
+        v = (self.far - points[:, 0]) * self.scale - 0.5
+        return np.stack([u, v], axis=1)
+
+
+def birds_eye(image: NDArray[np.uint8], camera: Camera, view: View | None = None) -> NDArray[np.uint8]:
+    """Return the road as seen from above.
+
+    Args:
+        image: (H, W, 3) or (H, W) uint8 of the camera's size, or of another resolution of the same view.
+        camera: The camera.
+        view: What to show.
+
+    Returns:
+        ``view.size`` uint8; black where the camera sees nothing.
+    """
+    view = view or View()
+    size = (image.shape[0], image.shape[1])
+    if size != camera.size:
+        camera = camera.resized(size)
+    if camera.distortion:
+        image = np.asarray(cv2.undistort(image, camera.matrix, np.array(camera.distortion)), np.uint8)
+    # Pixel of the picture from above -> metres -> pixel of the image.
+    step = 1 / view.scale
+    to_ground = np.array(
+        [[0.0, -step, view.far - 0.5 * step], [-step, 0.0, view.half_width - 0.5 * step], [0.0, 0.0, 1.0]]
+    )
+    matrix = camera.ground_homography @ to_ground
+    height, width = view.size
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpPerspective(image, matrix, (width, height), flags=flags), np.uint8)

@@ -1,0 +1,327 @@
+"""Lines and boxes -> metres: the ego lane's width, offset, heading and curvature, and the vehicle ahead.
+
+Every figure comes with an error from the fit and from how well the camera is known; a figure whose error is too large
+to be of use is None.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.processing.geometry import Camera
+from trilitenet.road.camera import CameraErrors
+from trilitenet.road.structures import EgoLane, Estimate, GroundCurve, LaneLine, LeadVehicle
+from trilitenet.structures import Boxes
+
+__all__ = ["REACH", "REAR_OVERHANG", "LaneFit", "LeadFilter", "fit_ego_lane", "find_lead", "ground_curve"]
+
+Floats = NDArray[np.float64]
+
+REACH: Final = 70.0
+"""Metres ahead that lines are used to."""
+PIXEL_ERROR: Final = 0.8
+"""Standard deviation of a line's place in a 640-pixel picture, in pixels."""
+BOX_ERROR: Final = 1.0
+"""Standard deviation of a box's lower edge in a 640-pixel picture, in pixels."""
+REAR_OVERHANG: Final = 0.8
+"""Metres from a car's rear to where its rear tyres touch the road, which is the lowest that is seen of it."""
+OVERHANG_ERROR: Final = 0.25
+"""Standard deviation of that, in metres: cars differ."""
+IN_LANE: Final = 0.7
+"""A vehicle is in the ego lane when its middle is within so much of half the lane's width."""
+MAX_OFFSET_ERROR: Final = 0.4
+MAX_HEADING_ERROR: Final = 0.04
+MAX_CURVATURE_ERROR: Final = 0.006
+MAX_DISTANCE_ERROR: Final = 0.30
+"""Of the distance, as a share."""
+
+
+class LaneFit(NamedTuple):
+    """The ego lane in metres.
+
+    Attributes:
+        lane: What there is to say of it.
+        centre: Its middle; None where only one line was seen and the width is not known.
+        half_width: Metres.
+    """
+
+    lane: EgoLane
+    centre: GroundCurve | None
+    half_width: float
+
+
+class _Points(NamedTuple):
+    x: Floats
+    y: Floats
+    error: Floats
+
+
+def _ground_points(line: LaneLine, camera: Camera) -> _Points:
+    """Return points of the curve on the road, with one standard deviation of y."""
+    v0, span = line.origin
+    rows = np.linspace(v0, v0 + span, 32)
+    columns = np.asarray(line.column(rows), np.float64)
+    ground = camera.to_ground(np.stack([columns, rows], axis=1))
+    keep = (ground[:, 0] > 1.0) & (ground[:, 0] < REACH)
+    x, y = ground[keep, 0], ground[keep, 1]
+    pixel = math.hypot(PIXEL_ERROR * camera.size[1] / 640, line.residual)
+    error = pixel * x / camera.fx * np.sqrt(1 + (y / camera.height) ** 2)
+    return _Points(x, y, np.maximum(error, 0.01))
+
+
+def _degree(x: Floats) -> int:
+    reach = float(np.ptp(x)) if len(x) else 0.0
+    return 1 if reach < 8 else 2 if reach < 22 else 3
+
+
+def ground_curve(line: LaneLine, camera: Camera) -> GroundCurve | None:
+    """Return the line in metres; None if too little of it lies on the road within reach."""
+    points = _ground_points(line, camera)
+    if len(points.x) < 4 or np.ptp(points.x) < 2.0:
+        return None
+    degree = _degree(points.x)
+    basis = np.vander(points.x, degree + 1, increasing=True)
+    solution, *_ = np.linalg.lstsq(basis / points.error[:, None], points.y / points.error, rcond=None)
+    polynomial = np.zeros(4)
+    polynomial[: degree + 1] = solution
+    return GroundCurve(polynomial, float(points.x.min()), float(points.x.max()))
+
+
+def fit_ego_lane(
+    left: LaneLine | None,
+    right: LaneLine | None,
+    camera: Camera,
+    errors: CameraErrors,
+    *,
+    known_width: Estimate | None = None,
+) -> LaneFit | None:
+    """Fit the two lines of the ego lane as one curve with two distances from it.
+
+    Args:
+        left: The line left of the vehicle.
+        right: The line right of it.
+        camera: The camera.
+        errors: How well it is known.
+        known_width: Width of the lane from earlier frames, for when one line is out of sight.
+
+    Returns:
+        None if there is no line that can be used.
+    """
+    sides = [_ground_points(line, camera) for line in (left, right) if line is not None]
+    names = [name for name, line in (("left", left), ("right", right)) if line is not None]
+    usable = [(name, p) for name, p in zip(names, sides, strict=True) if len(p.x) >= 4 and np.ptp(p.x) >= 2.0]
+    if not usable:
+        return None
+    count = len(usable)
+    x = np.concatenate([p.x for _, p in usable])
+    y = np.concatenate([p.y for _, p in usable])
+    sigma = np.concatenate([p.error for _, p in usable])
+    degree = _degree(x)
+    # Unknowns: where each line passes the vehicle, and the shared slope, bend and its change.
+    basis = np.zeros((len(x), count + degree))
+    start = 0
+    for side, (_, p) in enumerate(usable):
+        basis[start : start + len(p.x), side] = 1.0
+        start += len(p.x)
+    for power in range(1, degree + 1):
+        basis[:, count + power - 1] = x**power
+    weight = 1 / sigma
+    for _ in range(3):
+        scaled = basis * weight[:, None]
+        normal = scaled.T @ scaled + 1e-12 * np.eye(count + degree)
+        solution = np.linalg.solve(normal, scaled.T @ (y * weight))
+        missed = (y - basis @ solution) / sigma
+        weight = 1 / (sigma * np.sqrt(np.maximum(1.0, np.abs(missed) / 2.0)))
+    # Points of one line share most of their error: count every eighth of them.
+    covariance = np.linalg.inv(normal) * 8.0 * max(1.0, float(np.mean(missed**2)))
+    slope = float(solution[count])
+    bend = float(2 * solution[count + 1]) if degree >= 2 else 0.0
+    change = float(6 * solution[count + 2]) if degree >= 3 else 0.0
+    cos = 1 / math.sqrt(1 + slope * slope)
+    variance = np.diag(covariance)
+
+    def kept(value: float, error: float, limit: float) -> Estimate | None:
+        return Estimate(value, error) if math.isfinite(error) and error <= limit else None
+
+    side_error = math.sqrt(float(np.mean(variance[:count])))
+    width: Estimate | None = None
+    middle: float | None = None
+    middle_error = 0.0
+    half = 0.0
+    if count == 2:
+        apart = float(solution[0] - solution[1]) * cos
+        half = apart / 2
+        width = Estimate(apart, math.hypot(math.sqrt(2) * side_error, apart * errors.height))
+        middle, middle_error = float(solution[0] + solution[1]) / 2, side_error / math.sqrt(2)
+        if not 1.8 < apart < 6.5:
+            return None
+    elif known_width is not None:
+        half = known_width.value / 2
+        shift = half / cos if usable[0][0] == "right" else -half / cos
+        middle, middle_error = float(solution[0]) + shift, math.hypot(side_error, known_width.error)
+    offset = None
+    if middle is not None:
+        value = -middle * cos
+        tilt = (errors.yaw + errors.pitch) * float(x.min())
+        error = math.sqrt(middle_error**2 + (value * errors.height) ** 2 + tilt**2)
+        offset = kept(value, error, MAX_OFFSET_ERROR)
+    heading = kept(
+        -math.atan(slope),
+        math.sqrt(float(variance[count]) + errors.yaw**2 + (errors.pitch * (middle or 0.0) / camera.height) ** 2),
+        MAX_HEADING_ERROR,
+    )
+    curvature = None
+    if degree >= 2:
+        value = bend * cos**3
+        error = math.hypot(2 * math.sqrt(float(variance[count + 1])), abs(value) * (errors.focal + errors.height))
+        curvature = kept(value, error, MAX_CURVATURE_ERROR)
+    centre = None
+    if middle is not None:
+        polynomial = np.array([middle, slope, bend / 2, change / 6])
+        centre = GroundCurve(polynomial, float(x.min()), float(x.max()))
+    return LaneFit(EgoLane(width, offset, heading, curvature), centre, half)
+
+
+def _lane_at(centre: GroundCurve, x: float) -> float:
+    """Return y of the lane's middle; beyond what was seen it goes on straight."""
+    inside = min(max(x, 0.0), centre.end)
+    _, c1, c2, c3 = centre.polynomial
+    slope = c1 + inside * (2 * c2 + inside * 3 * c3)
+    return float(centre.at(inside) + slope * (x - inside))
+
+
+def find_lead(boxes: Boxes, fit: LaneFit, camera: Camera, errors: CameraErrors) -> LeadVehicle | None:
+    """Return the nearest vehicle in the ego lane.
+
+    Args:
+        boxes: Vehicles, in pixels of the camera's picture, (0, 0) being the first pixel's corner.
+        fit: The ego lane.
+        camera: The camera.
+        errors: How well it is known.
+
+    Returns:
+        None without one, or if its distance cannot be told well enough.
+    """
+    if fit.centre is None or not len(boxes):
+        return None
+    height, width = camera.size
+    left, _, right, bottom = boxes.xyxy.T.astype(np.float64) - 0.5
+    ground, left_end, right_end = (
+        camera.to_ground(np.stack([column, bottom], axis=1)) for column in ((left + right) / 2, left, right)
+    )
+    best: LeadVehicle | None = None
+    for index, (x, y) in enumerate(ground.tolist()):
+        if not math.isfinite(x) or x <= 0 or bottom[index] >= height - 1.5:
+            continue
+        middle = _lane_at(fit.centre, x)
+        if left[index] < 1 or right[index] > width - 2:
+            # Its middle is out of the picture: it counts if it surely stands across the lane's middle.
+            if not right_end[index, 1] + 0.3 < middle < left_end[index, 1] - 0.3:
+                continue
+        elif abs(y - middle) > IN_LANE * fit.half_width:
+            continue
+        distance = x - REAR_OVERHANG
+        if distance <= 0.5 or (best is not None and distance >= best.distance.value):
+            continue
+        error = _distance_error(x, camera, errors, BOX_ERROR * width / 640)
+        if error > MAX_DISTANCE_ERROR * distance:
+            continue
+        track = -1 if boxes.track_id is None else int(boxes.track_id[index])
+        best = LeadVehicle(index, track, Estimate(distance, error))
+    return best
+
+
+def _distance_error(x: float, camera: Camera, errors: CameraErrors, pixel: float) -> float:
+    per_radian = (x * x + camera.height**2) / camera.height
+    return math.sqrt(
+        (per_radian * math.hypot(pixel / camera.fy, errors.pitch)) ** 2
+        + (x * math.hypot(errors.height, errors.focal)) ** 2
+        + OVERHANG_ERROR**2
+    )
+
+
+class LeadFilter:
+    """Follows the distance to one vehicle over time (a Kalman filter of distance and speed) for the closing speed and
+    the time to collision."""
+
+    ACCELERATION: Final = 2.0
+    """Standard deviation of the relative acceleration in m/s^2."""
+    BOX_NOISE: Final = 0.5
+    """The part of `BOX_ERROR` that differs from frame to frame, in pixels."""
+    GAP: Final = 0.6
+    """Seconds without the vehicle after which it is forgotten."""
+    NEEDED: Final = 0.5
+    """Seconds of watching before a speed is told."""
+    MAX_SPEED_ERROR: Final = 2.0
+    MAX_TIME: Final = 30.0
+
+    def __init__(self) -> None:
+        self._state: Floats | None = None
+        self._covariance = np.zeros((2, 2))
+        self._identity = -1
+        self._box: NDArray[np.float32] | None = None
+        self._last = self._since = 0.0
+
+    def update(self, lead: LeadVehicle | None, boxes: Boxes, timestamp: float, camera: Camera) -> LeadVehicle | None:
+        """Return the lead with what its history tells.
+
+        Args:
+            lead: The lead of this frame.
+            boxes: The boxes that it indexes.
+            timestamp: Seconds.
+            camera: The camera.
+        """
+        if lead is None:
+            return None
+        box = boxes.xyxy[lead.box]
+        pixel = self.BOX_NOISE * camera.size[1] / 640
+        noise = pixel * (lead.distance.value**2 + camera.height**2) / (camera.fy * camera.height)
+        step = timestamp - self._last
+        if self._state is None or not 0 <= step <= self.GAP or not self._is_same(lead, box):
+            self._state = np.array([lead.distance.value, 0.0])
+            self._covariance = np.diag([noise**2, 15.0**2])
+            self._since = timestamp
+        else:
+            self._advance(step, lead.distance.value, noise)
+        self._last, self._identity, self._box = timestamp, lead.track_id, box
+        distance, rate = self._state.tolist()
+        spread = math.sqrt(max(self._covariance[0, 0], 0.0))
+        systematic = math.sqrt(max(lead.distance.error**2 - noise**2, 0.0))
+        found = Estimate(distance, math.hypot(spread, systematic))
+        speed_error = math.hypot(math.sqrt(self._covariance[1, 1]), rate * systematic / max(distance, 1.0))
+        if timestamp - self._since < self.NEEDED or speed_error > self.MAX_SPEED_ERROR:
+            return dataclasses.replace(lead, distance=found)
+        closing = Estimate(-rate, speed_error)
+        left = None
+        if closing.value > max(0.5, 2 * closing.error) and distance / closing.value < self.MAX_TIME:
+            time = distance / closing.value
+            left = Estimate(
+                time, time * math.hypot(spread / distance, math.sqrt(self._covariance[1, 1]) / closing.value)
+            )
+        return dataclasses.replace(lead, distance=found, closing_speed=closing, time_to_collision=left)
+
+    def _is_same(self, lead: LeadVehicle, box: NDArray[np.float32]) -> bool:
+        if lead.track_id >= 0 and self._identity >= 0:
+            return lead.track_id == self._identity
+        if self._box is None:
+            return False
+        low, high = np.maximum(box[:2], self._box[:2]), np.minimum(box[2:], self._box[2:])
+        shared = float(np.prod(np.maximum(high - low, 0)))
+        total = float(np.prod(box[2:] - box[:2]) + np.prod(self._box[2:] - self._box[:2])) - shared
+        return shared > 0.3 * total
+
+    def _advance(self, step: float, distance: float, noise: float) -> None:
+        assert self._state is not None
+        move = np.array([[1.0, step], [0.0, 1.0]])
+        push = np.array([step * step / 2, step])
+        state = move @ self._state
+        covariance = move @ self._covariance @ move.T + np.outer(push, push) * self.ACCELERATION**2
+        total = covariance[0, 0] + noise**2
+        gain = covariance[:, 0] / total
+        self._state = state + gain * (distance - state[0])
+        self._covariance = covariance - np.outer(gain, covariance[0])

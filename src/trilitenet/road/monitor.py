@@ -1,0 +1,195 @@
+"""Frame after frame of a video, or one picture, into what they tell of the road: the parts of this layer in their order."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.errors import ShapeError
+from trilitenet.processing.geometry import Camera
+from trilitenet.processing.polygons import mask_to_polygons
+from trilitenet.road.camera import CameraErrors, SelfCalibration
+from trilitenet.road.ego import LaneFit, LeadFilter, find_lead, fit_ego_lane, ground_curve
+from trilitenet.road.events import EventDetector, EventThresholds
+from trilitenet.road.lanes import assign_positions, find_lines, vanishing_point
+from trilitenet.road.structures import Estimate, LaneLine, Road
+from trilitenet.road.tracking import LineTracker, MaskSmoother, VehicleTracker
+from trilitenet.structures import Perception
+
+__all__ = ["RoadMonitor"]
+
+
+class RoadMonitor:
+    """Follows the road through a video; use a new one for each video and each picture.
+
+    Args:
+        camera: The camera, for any resolution of its view; estimated from the lanes if left out.
+        track: Give vehicles identities (needs the extra ``track``).
+        smoothing: Weight of the past in the masks, in [0, 1): 0 leaves them alone.
+        thresholds: When events begin and end.
+        field_of_view: Assumed horizontal field of view in degrees, without a camera.
+        lane_width: Assumed width of a lane in metres, without a camera.
+        still: This is a single picture.
+    """
+
+    def __init__(
+        self,
+        camera: Camera | None = None,
+        *,
+        track: bool = False,
+        smoothing: float = 0.0,
+        thresholds: EventThresholds | None = None,
+        field_of_view: float = 60.0,
+        lane_width: float = 3.5,
+        still: bool = False,
+    ) -> None:
+        self._given = camera
+        self._assumed = (field_of_view, lane_width)
+        self._still = still
+        self._tracker = VehicleTracker() if track else None
+        self._smoothers = (MaskSmoother(smoothing), MaskSmoother(smoothing))
+        self._events = EventDetector(thresholds)
+        self._lead = LeadFilter()
+        self._size: tuple[int, int] | None = None
+        self._camera: Camera | None = None
+        self._calibration: SelfCalibration | None = None
+        self._lines: LineTracker | None = None
+        self._width: Estimate | None = None
+        self._clock = 0.0
+
+    def __call__(self, perception: Perception) -> tuple[Perception, Road]:
+        """Take in the next frame.
+
+        Args:
+            perception: What the network sees. A frame of a video should have its timestamp; without one, frames are
+                taken to be 1/30 s apart.
+
+        Returns:
+            The perception with identities and smoothed masks where these were asked for, and the road.
+
+        Raises:
+            ShapeError: If the frame has another shape than the camera.
+        """
+        self._prepare(perception.size)
+        timestamp = self._clock if perception.timestamp is None else perception.timestamp
+        self._clock = timestamp + 1 / 30
+        perception = self._steady(perception, timestamp)
+        lines = [] if perception.lane is None else find_lines(perception.lane)
+        drivable = () if perception.drivable is None else _outlines(perception.drivable)
+        if self._lines is not None:
+            lines = self._lines.update(lines)
+        camera, errors, calibrated = self._trusted(lines)
+        if camera is None:
+            lines = assign_positions(lines, [_column_right(line, perception.size) for line in lines])
+            if self._calibration is not None:
+                self._calibration.update(lines)
+            return perception, Road(tuple(lines), drivable)
+        lines = [dataclasses.replace(line, ground=ground_curve(line, camera)) for line in lines]
+        lines = assign_positions(lines, [_metres_right(line) for line in lines])
+        if self._calibration is not None:
+            self._calibration.update(lines)
+        road = Road(tuple(lines), drivable, camera=camera, calibrated=calibrated)
+        fit = fit_ego_lane(*road.ego_lines, camera, errors, known_width=self._width)
+        if fit is not None:
+            road = self._with_lane(road, fit, perception, camera, errors, timestamp)
+        if not self._still:
+            road = dataclasses.replace(road, events=self._events.update(road, timestamp, perception.frame))
+        return perception, road
+
+    def _prepare(self, size: tuple[int, int]) -> None:
+        if size == self._size:
+            return
+        self._size = size
+        self._lines = None if self._still else LineTracker(size)
+        if self._given is not None:
+            wide, given = size[1] / size[0], self._given.size[1] / self._given.size[0]
+            if abs(wide / given - 1) > 0.01:
+                raise ShapeError(
+                    f"the camera file is for {self._given.size[1]}x{self._given.size[0]} pixels, the picture has "
+                    f"{size[1]}x{size[0]}, which is another shape; calibrate for it or leave the camera out"
+                )
+            self._camera = self._given if size == self._given.size else self._given.resized(size)
+        else:
+            field_of_view, lane_width = self._assumed
+            self._calibration = SelfCalibration(
+                size, field_of_view=field_of_view, lane_width=lane_width, still=self._still
+            )
+
+    def _steady(self, perception: Perception, timestamp: float) -> Perception:
+        """Smooth the masks and track the boxes, where asked for."""
+        if self._smoothers[0].strength > 0:
+            drivable, lane = (
+                None if mask is None else smoother.update(mask)
+                for mask, smoother in zip((perception.drivable, perception.lane), self._smoothers, strict=True)
+            )
+            perception = dataclasses.replace(perception, drivable=drivable, lane=lane)
+        if self._tracker is not None and perception.boxes is not None:
+            perception = dataclasses.replace(perception, boxes=self._tracker.update(perception.boxes, timestamp))
+        return perception
+
+    def _trusted(self, lines: list[LaneLine]) -> tuple[Camera | None, CameraErrors, str | None]:
+        """Return the camera, how well it is known for this frame, and where it is from."""
+        if self._camera is not None:
+            camera, errors, origin = self._camera, CameraErrors(), "file"
+        else:
+            calibration = self._calibration
+            assert calibration is not None
+            if self._still:
+                calibration.update(assign_positions(lines, [_column_right(line, calibration.size) for line in lines]))
+            if calibration.camera is None:
+                return None, CameraErrors(), None
+            camera, errors, origin = calibration.camera, calibration.errors, "lanes"
+        # Where this frame's lanes surely vanish elsewhere, the car pitches: what rests on the horizon is less sure.
+        seen = vanishing_point(lines, camera.size)
+        if seen is not None and seen.lines >= 2:
+            away = abs(seen.v - camera.vanishing_point()[1])
+            if away > 3 * seen.error:
+                errors = dataclasses.replace(errors, pitch=max(errors.pitch, away / camera.fy))
+        return camera, errors, origin
+
+    def _with_lane(
+        self, road: Road, fit: LaneFit, perception: Perception, camera: Camera, errors: CameraErrors, timestamp: float
+    ) -> Road:
+        width = fit.lane.width
+        if width is not None:
+            past = self._width
+            mean = width.value if past is None else 0.95 * past.value + 0.05 * width.value
+            self._width = Estimate(mean, max(0.1, width.error))
+        lead = None
+        if perception.boxes is not None:
+            lead = find_lead(perception.boxes, fit, camera, errors)
+            if not self._still:
+                lead = self._lead.update(lead, perception.boxes, timestamp, camera)
+        lane = fit.lane
+        if lane.width is None and lane.offset is not None:
+            lane = dataclasses.replace(lane, width=self._width)
+        return dataclasses.replace(road, ego_lane=lane, lead=lead)
+
+
+def _outlines(mask: NDArray[np.bool_]) -> tuple[NDArray[np.float32], ...]:
+    """Return outlines of the drivable area, precise to 1/320 of the width, without specks."""
+    width = mask.shape[1]
+    return tuple(mask_to_polygons(mask, tolerance=width / 320, min_area=0.0005 * mask.size))
+
+
+def _column_right(line: LaneLine, size: tuple[int, int]) -> float | None:
+    """Return how many pixels right of the middle the line meets the lower edge; None if it ends too far from it."""
+    height, width = size
+    if line.origin[0] < 0.62 * height or line.confidence < 0.3:
+        return None
+    return float(line.column(height - 1.0)) - (width - 1) / 2
+
+
+def _metres_right(line: LaneLine) -> float | None:
+    """Return how many metres right of the vehicle the line passes it; None if it is only seen far away."""
+    if line.ground is None or line.ground.start > 25 or line.confidence < 0.3:
+        return None
+    near = min(max(line.ground.start, 3.0), line.ground.end)
+    value = float(line.ground.at(near))
+    c1, c2, c3 = line.ground.polynomial[1:].tolist()
+    slope = c1 + near * (2 * c2 + near * 3 * c3)
+    value -= slope * near
+    return -value if math.isfinite(value) and abs(value) < 40 else None
