@@ -12,9 +12,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-
-pytest.importorskip("fastapi", reason="the extra 'serve' is not installed")
-
 from starlette.testclient import TestClient
 
 from trilitenet.apps.server.application import Application, create_app

@@ -17,17 +17,15 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from selenium import webdriver
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import WebDriverWait
 
 from tests.apps.server.conftest import TOKEN, FakeBackend, Running, encode, picture
 from trilitenet.apps.server.application import create_app
 from trilitenet.apps.server.settings import Settings
 from trilitenet.inference.predictor import Predictor
-
-webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-
-from selenium.webdriver.common.by import By
-from selenium.webdriver.common.keys import Keys
-from selenium.webdriver.support.ui import WebDriverWait
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 CHROMEDRIVER = shutil.which("chromedriver")
@@ -262,7 +260,7 @@ def test_a_broken_file_is_explained_and_the_page_goes_on(
 def test_the_keyboard_is_enough(page: Page, photo: Path) -> None:
     page.see(photo)
     page.script("document.activeElement.blur(); window.scrollTo(0, 0)")
-    order = []
+    order: list[str] = []
     for _ in range(30):
         webdriver.ActionChains(page.driver).send_keys(Keys.TAB).perform()
         focused = page.script("return document.activeElement.id || document.activeElement.className || 'summary'")

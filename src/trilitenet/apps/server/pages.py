@@ -12,10 +12,14 @@ from starlette.responses import Response
 
 __all__ = ["PAGE_PATHS", "pages_router"]
 
+_SCRIPTS: Final = ("app.js", "client.js", "draw.js", "sources.js")
 _FILES: Final = {
     "/": ("index.html", "text/html; charset=utf-8"),
     "/app.css": ("app.css", "text/css; charset=utf-8"),
-    **{f"/{name}": (name, "text/javascript; charset=utf-8") for name in ("app.js", "client.js", "draw.js", "sources.js")},
+    **{
+        f"/{name}": (name, "text/javascript; charset=utf-8")
+        for name in ("app.js", "client.js", "draw.js", "sources.js")
+    },
     "/icon.svg": ("icon.svg", "image/svg+xml"),
 }
 PAGE_PATHS: Final = frozenset(_FILES)
