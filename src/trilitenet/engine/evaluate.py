@@ -16,12 +16,13 @@ import datetime
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import ModelCard, Task, Thresholds
+from trilitenet.engine.predictions import SavedPredictions
 from trilitenet.engine.provenance import describe_hardware, describe_versions, peak_memory
 from trilitenet.engine.report import Provenance, Report
 from trilitenet.engine.scorecard import CONDITIONS, PAPER_THRESHOLDS, Scorecard, protocols_of
@@ -40,11 +41,13 @@ __all__ = [
     "best_thresholds",
     "evaluate",
     "provenance_now",
+    "score_predictions",
 ]
 
 LOWEST_CONFIDENCE: Final = 0.001
 """Boxes down to this confidence are scored (the published one); average precision needs the doubtful ones too."""
 
+_T = TypeVar("_T")
 Prediction = tuple[Perception | None, CanvasPrediction | None]
 ImageChange = Callable[[NDArray[np.uint8], str], NDArray[np.uint8]]
 """Given an (H, W, 3) uint8 RGB image and its name, returns the image to show to the network, of the same size."""
@@ -171,6 +174,104 @@ def evaluate(
         resamples=resamples,
         seed=seed,
     )
+
+
+def score_predictions(
+    predictions: SavedPredictions,
+    dataset: LabelledImages,
+    *,
+    protocol: str = "fair",
+    confidence: float = 0.25,
+    limit: int | None = None,
+    resamples: int = 1000,
+    seed: int = 0,
+    worst: int = 24,
+    by: Sequence[str] = CONDITIONS,
+    paper_batch: int = 16,
+    about: Mapping[str, Any] | None = None,
+) -> Report:
+    """Score saved predictions of any model, by the lines that score a predictor.
+
+    Under the 'paper' protocol masks are brought to the size they would have inside the 640-pixel canvas by area
+    interpolation, and count where the greater half of a pixel is foreground.
+
+    Args:
+        predictions: As `trilitenet.engine.predictions` describes.
+        dataset: Labelled images of the same names, in the order that batches of the 'paper' protocol are made of.
+        protocol: ``"fair"``, ``"paper"`` or ``"both"``.
+        confidence: The stated confidence of precision, recall and F1.
+        limit: Only the first so many images.
+        resamples: Bootstrap draws for the 95% intervals; 0 for none.
+        seed: Of the draws.
+        worst: How many of the worst images to keep pictures of, a task; 0 for none.
+        by: Attributes to make tables by.
+        paper_batch: Images a batch of the published averages.
+        about: Fields of `Provenance` that only the caller knows.
+
+    Raises:
+        ConfigError: If there is no such protocol.
+        DataError: If there are no images, predictions are for none of them, or one is broken.
+    """
+    protocols = protocols_of(protocol)
+    scorecard = Scorecard(
+        dataset.class_names,
+        predictions.tasks,
+        protocol=protocol,
+        confidence=confidence,
+        paper_batch=paper_batch,
+        worst=worst,
+        by=by,
+    )
+    started = time.time()
+    count = len(dataset) if limit is None else min(limit, len(dataset))
+    canvases: dict[tuple[int, int], None] = {}
+    known = 0
+    for sample, perception in _ahead(lambda index: _with_saved(dataset[index], predictions), range(count), 4):
+        known += sample.name in predictions.names
+        letterbox = Letterbox.fit(perception.size)
+        canvases[letterbox.canvas] = None
+        scorecard.add(
+            sample,
+            perception if "fair" in protocols else None,
+            _saved_on_canvas(perception, letterbox) if "paper" in protocols else None,
+        )
+    if predictions.names and not known:
+        raise DataError(
+            f"{predictions.folder}: predictions for none of the {count} images "
+            f"(such as {min(predictions.names)!r}); image_id must be the name of the image without ending"
+        )
+    return scorecard.report(
+        lambda images: provenance_now(
+            images,
+            started,
+            {
+                "model": str(predictions.folder),
+                "runtime": "saved predictions",
+                "thresholds": {"confidence": confidence},
+                "canvas": tuple(f"{width}x{height}" for height, width in canvases),
+                "settings": _settings(protocols, paper_batch, resamples, seed),
+                **(about or {}),
+            },
+        ),
+        resamples=resamples,
+        seed=seed,
+    )
+
+
+def _with_saved(sample: LabelledImage, predictions: SavedPredictions) -> tuple[LabelledImage, Perception]:
+    height, width = sample.image.shape[:2]
+    return sample, predictions.get(sample.name, (height, width))
+
+
+def _saved_on_canvas(perception: Perception, letterbox: Letterbox) -> CanvasPrediction:
+    def shrink(mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+        return None if mask is None else letterbox.mask(mask, threshold=127)[letterbox.inside].astype(np.bool_)
+
+    boxes = perception.boxes
+    if boxes is not None:
+        kept = np.flatnonzero(boxes.confidence > PAPER_THRESHOLDS.confidence)[: PAPER_THRESHOLDS.max_boxes]
+        boxes = boxes.select(kept)
+    return CanvasPrediction(boxes, shrink(perception.drivable), shrink(perception.lane), letterbox)
 
 
 def check_classes(card: ModelCard, dataset: LabelledImages) -> None:
@@ -413,12 +514,10 @@ def _stack(canvases: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
     return canvases[0][None] if len(canvases) == 1 else np.stack(canvases)
 
 
-def _ahead(
-    prepare: Callable[[int], tuple[LabelledImage, NDArray[np.uint8], Letterbox]], order: Iterable[int], depth: int
-) -> Iterator[tuple[LabelledImage, NDArray[np.uint8], Letterbox]]:
+def _ahead(prepare: Callable[[int], _T], order: Iterable[int], depth: int) -> Iterator[_T]:
     """Yield what is prepared, in order, up to ``depth`` ahead."""
     with ThreadPoolExecutor(1, thread_name_prefix="reader") as pool:
-        waiting: collections.deque[Future[tuple[LabelledImage, NDArray[np.uint8], Letterbox]]] = collections.deque()
+        waiting: collections.deque[Future[_T]] = collections.deque()
         try:
             for index in order:
                 waiting.append(pool.submit(prepare, index))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
 import io
 import json
@@ -18,7 +17,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from trilitenet.engine.figures import CONDITION_FIGURES, meaning
+from trilitenet.engine.figures import CONDITION_FIGURES, HEADLINES, meaning
+from trilitenet.engine.page import percent
 from trilitenet.engine.scoring import FairMetrics, FairScores, PaperMetrics, PaperScores
 from trilitenet.errors import DataError, OutputError
 
@@ -30,8 +30,8 @@ __all__ = [
     "Figure",
     "Provenance",
     "Report",
+    "Variation",
     "WorstFrame",
-    "percent",
     "read_report",
 ]
 
@@ -76,6 +76,23 @@ class Condition:
     def few(self) -> bool:
         """Whether there are too few images to say much."""
         return self.images < FEW_IMAGES
+
+
+@dataclasses.dataclass(frozen=True)
+class Variation:
+    """Figures under another circumstance: corrupted images, another input size.
+
+    Attributes:
+        kind: What is varied, as a heading.
+        name: For example ``"fog 3"`` or ``"512"``.
+        figures: Figure key -> value.
+        note: How to read the table.
+    """
+
+    kind: str
+    name: str
+    figures: dict[str, float]
+    note: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,6 +190,7 @@ class Report:
         worst: The images that went worst, a task after the other.
         names: The images, in order.
         state: Counts an image, from which every figure can be computed again.
+        variations: Figures on corrupted images and at other input sizes, where measured.
     """
 
     provenance: Provenance
@@ -184,6 +202,7 @@ class Report:
     worst: tuple[WorstFrame, ...]
     names: tuple[str, ...]
     state: dict[str, Any] = dataclasses.field(repr=False)
+    variations: tuple[Variation, ...] = ()
 
     @property
     def protocols(self) -> tuple[str, ...]:
@@ -210,6 +229,7 @@ class Report:
                 {"task": frame.task, "name": frame.name, "score": frame.score, "note": frame.note}
                 for frame in self.worst
             ],
+            "variations": [dataclasses.asdict(variation) for variation in self.variations],
             "images": list(self.names),
             "state": self.state,
         }
@@ -240,6 +260,7 @@ class Report:
             tables.append(_figure_table(protocol, self.figures))
         tables.append(_exclusions(self))
         tables += [_condition_table(protocol, self.conditions) for protocol in self.protocols if self.conditions]
+        tables += _variation_tables(self.variations)
         return render(tables)
 
 
@@ -252,11 +273,6 @@ def render(parts: list[Any]) -> str:
     for part in parts:
         console.print(part)
     return buffer.getvalue().rstrip()
-
-
-def percent(value: float | None, digits: int = 1) -> str:
-    """Return a ratio as per cent, a dash where it is undefined."""
-    return "-" if value is None or math.isnan(value) else f"{100 * value:.{digits}f}"
 
 
 def _figure_table(protocol: str, figures: Mapping[str, Figure]) -> Table:
@@ -307,6 +323,21 @@ def _condition_table(protocol: str, conditions: tuple[Condition, ...]) -> Table:
         )
         last = row.attribute
     return table
+
+
+def _variation_tables(variations: tuple[Variation, ...]) -> list[Table]:
+    tables = []
+    for kind in dict.fromkeys(variation.kind for variation in variations):
+        members = [variation for variation in variations if variation.kind == kind]
+        keys = [key for key in HEADLINES if key in members[0].figures]
+        table = Table(title=f"{kind} (per cent)", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+        table.add_column("")
+        for key in keys:
+            table.add_column(f"{key.split('/')[1]} {meaning(key).title}", justify="right")
+        for member in members:
+            table.add_row(member.name, *(percent(member.figures.get(key)) for key in keys))
+        tables.append(table)
+    return tables
 
 
 def _provenance_text(provenance: Provenance) -> Text:
@@ -372,6 +403,15 @@ def read_report(path: Path) -> Report:
             ),
             names=tuple(mapping["images"]),
             state=state,
+            variations=tuple(
+                Variation(
+                    row["kind"],
+                    row["name"],
+                    {key: _number(value) for key, value in row["figures"].items()},
+                    row["note"],
+                )
+                for row in mapping["variations"]
+            ),
         )
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
@@ -414,8 +454,3 @@ def _write(path: Path, text: str) -> None:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
-
-
-def as_data_uri(picture: bytes) -> str:
-    """Return a JPEG as a data URI."""
-    return f"data:image/jpeg;base64,{base64.b64encode(picture).decode()}"

@@ -81,14 +81,16 @@ def draw_at_width(centre: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
     Returns:
         (H, W) uint8 of 0 and 1.
     """
-    middle = (width - 1) // 2
-    kernel = _disc(float(width))
-    drawn = cv2.dilate(centre, kernel, anchor=(middle, middle), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    # Of an even number of pixels `thin` keeps the upper or the right one of the middle two.
+    anchor = ((width - 1) // 2, width // 2)
+    drawn = cv2.dilate(centre, _disc(float(width)), anchor=anchor, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return np.asarray(drawn, np.uint8)
 
 
 def thin(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Thin a mask to centre lines one pixel wide (Zhang and Suen, CACM 1984).
+    """Thin a mask to centre lines one pixel wide (Guo and Hall, CACM 1989).
+
+    Unlike the better known thinning of Zhang and Suen it keeps slanted lines that are two pixels wide.
 
     Args:
         mask: (H, W) uint8 of 0 and 1.
@@ -124,13 +126,14 @@ def thin(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _thinning_tables() -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return, for each of the two passes, whether a pixel goes, by the 8-bit code of its neighbours."""
     code = np.arange(256)
-    p = [(code >> bit) & 1 for bit in range(8)]  # P2 .. P9
-    neighbours = sum(p)
-    rises = sum(((1 - p[i]) & p[(i + 1) % 8]) for i in range(8))
-    thinnable = (neighbours >= 2) & (neighbours <= 6) & (rises == 1)
-    north, east, south, west = p[0], p[2], p[4], p[6]
-    first = thinnable & (north * east * south == 0) & (east * south * west == 0)
-    second = thinnable & (north * east * west == 0) & (north * south * west == 0)
+    p = [((code >> bit) & 1).astype(np.bool_) for bit in range(8)]  # P2 .. P9
+    parts = sum((~p[i] & (p[i + 1] | p[(i + 2) % 8])).astype(np.int64) for i in (0, 2, 4, 6))
+    pairs = sum((p[i - 1] | p[i]).astype(np.int64) for i in (0, 2, 4, 6))
+    others = sum((p[i] | p[i + 1]).astype(np.int64) for i in (0, 2, 4, 6))
+    neighbours = np.minimum(pairs, others)
+    thinnable = (parts == 1) & (neighbours >= 2) & (neighbours <= 3)
+    first = thinnable & ~((p[4] | p[5] | ~p[7]) & p[6])
+    second = thinnable & ~((p[0] | p[1] | ~p[3]) & p[2])
     return first, second
 
 

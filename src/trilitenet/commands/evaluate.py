@@ -1,0 +1,158 @@
+"""Measure a model on labelled images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Literal
+
+from trilitenet.commands.load import load
+from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER, DrivingDataset
+from trilitenet.engine.evaluate import evaluate as run_evaluation
+from trilitenet.engine.predictions import PredictionWriter
+from trilitenet.engine.provenance import hash_files
+from trilitenet.engine.report import Report
+from trilitenet.engine.scorecard import CONDITIONS
+from trilitenet.errors import OutputError
+
+__all__ = ["evaluate", "hash_dataset", "hash_model", "write_report"]
+
+
+def evaluate(
+    model: str = "tiny",
+    /,
+    *,
+    data: Path,
+    split: str = "val",
+    protocol: Literal["fair", "paper", "both"] = "fair",
+    output: Path | None = None,
+    save: Path | None = None,
+    overwrite: bool = False,
+    limit: int | None = None,
+    resamples: int = 1000,
+    worst: int = 24,
+    by: Sequence[str] = CONDITIONS,
+    paper_batch: int = 16,
+    batch_size: int = 1,
+    device: str = "auto",
+    backend: str = "auto",
+    confidence: float | None = None,
+    iou: float | None = None,
+    drivable: float | None = None,
+    lane: float | None = None,
+    long_side: int | None = None,
+) -> Report:
+    """Measure a model on labelled images, under the published protocol, a fair one, or both.
+
+    Args:
+        model: Name of shipped weights, a weight file, or an exported artefact of any runtime.
+        data: Root folder of a data set in the published layout.
+        split: Split to measure on.
+        protocol: fair (native size, one confusion matrix, COCO matching), paper (as published), or both.
+        output: Folder to write report.json and report.html to.
+        save: Folder to write the predictions to, as `trilitenet score` reads them.
+        overwrite: Replace reports and predictions that are there.
+        limit: Measure on the first so many images alone.
+        resamples: Bootstrap draws for the 95% intervals; 0 for none.
+        worst: How many of the worst images the page shows, a task.
+        by: Attributes to make tables by.
+        paper_batch: Images a batch of the published averages.
+        batch_size: At most so many images go through the network at once.
+        device: auto, cpu, cuda, cuda:1, mps.
+        backend: auto (what the file is for) or the name of a runtime.
+        confidence: State precision, recall and F1 above this confidence; the model's own if left out.
+        iou: A box goes when it overlaps a better one by more; the model's own if left out.
+        drivable: A pixel is drivable above this probability; the model's own if left out.
+        lane: A pixel is lane marking above this probability; the model's own if left out.
+        long_side: The longer side of an image is resized to so many pixels.
+
+    Returns:
+        The report.
+    """
+    check_output(output, overwrite)
+    predictor = load(
+        model,
+        device=device,
+        backend=backend,
+        confidence=confidence,
+        iou=iou,
+        drivable=drivable,
+        lane=lane,
+        long_side=long_side,
+    )
+    with predictor, ExitStack() as stack:
+        dataset = DrivingDataset(data, split, class_names=predictor.card.class_names)
+        writer = None
+        if save is not None:
+            writer = stack.enter_context(PredictionWriter(save, predictor.card.tasks, overwrite=overwrite))
+        report = run_evaluation(
+            predictor,
+            dataset,
+            protocol=protocol,
+            batch_size=batch_size,
+            limit=limit,
+            resamples=resamples,
+            worst=worst,
+            by=by,
+            paper_batch=paper_batch,
+            on_prediction=None if writer is None else lambda sample, prediction: writer.write(sample.name, prediction),
+            about={
+                "model": model,
+                "model_sha256": hash_model(model),
+                "data": str(data),
+                "split": split,
+                "data_sha256": hash_dataset(dataset, limit),
+            },
+        )
+    write_report(report, output)
+    return report
+
+
+def hash_model(model: str) -> str | None:
+    """Return the SHA-256 of a weight file, or of the files of an exported artefact."""
+    from trilitenet.models.weights import shipped_weights
+
+    path = shipped_weights().get(model) or Path(model)
+    if path.is_dir():
+        return hash_files(file for file in path.rglob("*") if file.is_file())
+    weights = path.with_suffix(".bin")  # OpenVINO keeps them beside the graph
+    if path.suffix == ".xml" and weights.is_file():
+        return hash_files([path, weights])
+    return hash_file(path) if path.is_file() else None
+
+
+def hash_file(path: Path) -> str:
+    """Return the SHA-256 of a file, as ``sha256sum`` prints it."""
+    import hashlib
+
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def hash_dataset(dataset: DrivingDataset, limit: int | None = None) -> dict[str, str]:
+    """Return the SHA-256 of images, masks and boxes, apart, of the images that are measured on."""
+    names = dataset.names[:limit]
+    root, split = dataset.root, dataset.split
+    return {
+        "images": hash_files(dataset.image_path(index) for index in range(len(names))),
+        "drivable": hash_files(root / DRIVABLE_FOLDER / split / f"{name}.png" for name in names),
+        "lane": hash_files(root / LANE_FOLDER / split / f"{name}.png" for name in names),
+        "boxes": hash_files(root / DETECTION_FOLDER / split / f"{name}.json" for name in names),
+    }
+
+
+def check_output(output: Path | None, overwrite: bool) -> None:
+    """Refuse, before hours of work, a folder that holds a report.
+
+    Raises:
+        OutputError: If it does.
+    """
+    if output is not None and not overwrite and (output / "report.json").exists():
+        raise OutputError(f"{output}: holds report.json already; give another folder or --overwrite")
+
+
+def write_report(report: Report, output: Path | None) -> None:
+    """Write report.json and report.html into a folder."""
+    if output is not None:
+        report.save_json(output / "report.json")
+        report.save_html(output / "report.html")

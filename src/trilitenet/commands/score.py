@@ -1,0 +1,91 @@
+"""Measure saved predictions of any model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from trilitenet.commands.evaluate import check_output, hash_dataset, write_report
+from trilitenet.data.reading import DrivingDataset
+from trilitenet.engine.evaluate import score_predictions
+from trilitenet.engine.predictions import DETECTIONS_FILE, SavedPredictions
+from trilitenet.engine.provenance import hash_files
+from trilitenet.engine.report import Report
+from trilitenet.engine.scorecard import CONDITIONS
+
+__all__ = ["score"]
+
+
+def score(
+    predictions: Path,
+    /,
+    *,
+    data: Path,
+    split: str = "val",
+    classes: Sequence[str] = ("vehicle",),
+    protocol: Literal["fair", "paper", "both"] = "fair",
+    confidence: float = 0.25,
+    output: Path | None = None,
+    overwrite: bool = False,
+    limit: int | None = None,
+    resamples: int = 1000,
+    worst: int = 24,
+    by: Sequence[str] = CONDITIONS,
+    paper_batch: int = 16,
+) -> Report:
+    """Measure saved predictions of any model, on the scale of `trilitenet evaluate`.
+
+    Args:
+        predictions: Folder with detections.json (COCO results), drivable/NAME.png and lane/NAME.png, or some of them.
+        data: Root folder of a data set in the published layout.
+        split: Split that the predictions are for.
+        classes: Detection classes; category_id 1 is the first.
+        protocol: fair (native size, one confusion matrix, COCO matching), paper (as published), or both.
+        confidence: State precision, recall and F1 above this confidence.
+        output: Folder to write report.json and report.html to.
+        overwrite: Replace a report that is there.
+        limit: Measure on the first so many images alone.
+        resamples: Bootstrap draws for the 95% intervals; 0 for none.
+        worst: How many of the worst images the page shows, a task.
+        by: Attributes to make tables by.
+        paper_batch: Images a batch of the published averages.
+
+    Returns:
+        The report.
+    """
+    check_output(output, overwrite)
+    dataset = DrivingDataset(data, split, class_names=tuple(classes))
+    saved = SavedPredictions(predictions, classes)
+    report = score_predictions(
+        saved,
+        dataset,
+        protocol=protocol,
+        confidence=confidence,
+        limit=limit,
+        resamples=resamples,
+        worst=worst,
+        by=by,
+        paper_batch=paper_batch,
+        about={
+            "model": str(predictions),
+            "model_sha256": hash_files(
+                [predictions / DETECTIONS_FILE]
+                + [
+                    predictions / task / f"{name}.png"
+                    for task in ("drivable", "lane")
+                    for name in dataset.names[:limit]
+                ]
+            ),
+            "data": str(data),
+            "split": split,
+            "data_sha256": hash_dataset(dataset, limit),
+        },
+    )
+    write_report(report, output)
+    return report
+
+
+def _hash_predictions(folder: Path, names: Sequence[str]) -> str:
+    masks = [folder / task / f"{name}.png" for task in ("drivable", "lane") for name in names]
+    return hash_files([folder / DETECTIONS_FILE, *masks])

@@ -1,0 +1,227 @@
+"""Predictions on disk, of any model: the form that `trilitenet score` reads and `trilitenet evaluate --save` writes.
+
+    DIR/detections.json      COCO results: image_id = name of the image without ending, bbox = [left, top, width,
+                             height] in pixels of the image as stored, score in [0, 1], category_id = 1, 2, ... in the
+                             order of the classes (with one class: anything)
+    DIR/drivable/NAME.png    above 0 = drivable, same size as the image
+    DIR/lane/NAME.png        above 0 = lane marking, same size as the image
+
+A part that is not there is a task that the model lacks. An image without an entry in ``detections.json`` has no boxes;
+an image without a mask, where others have one, is an error.
+"""
+
+from __future__ import annotations
+
+import array
+import json
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.config import TASKS, Task
+from trilitenet.errors import DataError, OutputError
+from trilitenet.structures import Boxes, Perception
+
+__all__ = ["DETECTIONS_FILE", "PredictionWriter", "SavedPredictions"]
+
+DETECTIONS_FILE: Final = "detections.json"
+
+
+class PredictionWriter:
+    """Write predictions as they come; a context manager.
+
+    Args:
+        folder: Made if need be; it must hold no predictions yet.
+        tasks: The tasks to write.
+        overwrite: Replace predictions that are there.
+
+    Raises:
+        OutputError: If the folder holds predictions, or cannot be written.
+    """
+
+    def __init__(self, folder: Path, tasks: Sequence[Task], *, overwrite: bool = False) -> None:
+        self.folder = folder
+        self._tasks = tuple(tasks)
+        self._file: IO[str] | None = None
+        self._first = True
+        held = [name for name in (DETECTIONS_FILE, "drivable", "lane") if (folder / name).exists()]
+        if held and not overwrite:
+            raise OutputError(f"{folder}: holds {held[0]} already; give another folder or --overwrite")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for task in self._tasks:
+                if task != "detection":
+                    (folder / task).mkdir(exist_ok=True)
+            if "detection" in self._tasks:
+                self._file = (folder / DETECTIONS_FILE).open("w", encoding="utf-8")
+                self._file.write("[")
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot be written ({error.strerror})") from error
+
+    def __enter__(self) -> PredictionWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def write(self, name: str, prediction: Perception) -> None:
+        """Add the prediction for an image.
+
+        Raises:
+            OutputError: If a file cannot be written.
+        """
+        if self._file is not None and prediction.boxes is not None:
+            boxes = prediction.boxes
+            for box, score, number in zip(boxes.xyxy, boxes.confidence, boxes.class_id, strict=True):
+                left, top, right, bottom = (float(value) for value in box)
+                entry = {
+                    "image_id": name,
+                    "category_id": int(number) + 1,
+                    "bbox": [round(value, 3) for value in (left, top, right - left, bottom - top)],
+                    "score": float(f"{score:.7g}"),
+                }
+                self._file.write(("\n" if self._first else ",\n") + json.dumps(entry))
+                self._first = False
+        for task in self._tasks:
+            mask: NDArray[np.bool_] | None = getattr(prediction, task, None) if task != "detection" else None
+            if mask is not None:
+                path = self.folder / task / f"{name}.png"
+                encoded = cv2.imencode(".png", mask.astype(np.uint8) * 255)[1]
+                try:
+                    path.write_bytes(bytes(np.asarray(encoded, np.uint8)))
+                except OSError as error:
+                    raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
+
+    def close(self) -> None:
+        """Finish ``detections.json``. Calling it twice is harmless."""
+        if self._file is not None:
+            self._file.write("\n]\n")
+            self._file.close()
+            self._file = None
+
+
+class SavedPredictions:
+    """Predictions read from disk.
+
+    Args:
+        folder: In the form above.
+        class_names: Detection classes, category 1 first.
+
+    Raises:
+        DataError: If there is nothing in the folder, or ``detections.json`` has another form.
+    """
+
+    def __init__(self, folder: Path, class_names: Sequence[str]) -> None:
+        self.folder = folder
+        self.class_names = tuple(class_names)
+        present = {
+            "detection": (folder / DETECTIONS_FILE).is_file(),
+            "drivable": (folder / "drivable").is_dir(),
+            "lane": (folder / "lane").is_dir(),
+        }
+        self.tasks: tuple[Task, ...] = tuple(task for task in TASKS if present[task])
+        if not self.tasks:
+            raise DataError(f"{folder}: no predictions; expected {DETECTIONS_FILE}, drivable/NAME.png or lane/NAME.png")
+        self._boxes: dict[str, Boxes] = {}
+        if present["detection"]:
+            self._boxes = self._read_detections(folder / DETECTIONS_FILE)
+
+    @property
+    def names(self) -> set[str]:
+        """Images that have boxes."""
+        return set(self._boxes)
+
+    def get(self, name: str, size: tuple[int, int]) -> Perception:
+        """Return the prediction for an image.
+
+        Args:
+            name: Of the image, without ending.
+            size: (height, width) of the image.
+
+        Raises:
+            DataError: If a mask is missing, broken or of another size.
+        """
+        boxes = self._boxes.get(name, Boxes.empty()) if "detection" in self.tasks else None
+        return Perception(
+            size=size,
+            class_names=self.class_names,
+            boxes=boxes,
+            drivable=self._mask("drivable", name, size),
+            lane=self._mask("lane", name, size),
+        )
+
+    def _mask(self, task: Task, name: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+        if task not in self.tasks:
+            return None
+        path = self.folder / task / f"{name}.png"
+        if not path.is_file():
+            raise DataError(f"{path}: missing; every image needs a mask (an empty one where nothing is predicted)")
+        grey = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE) if path.stat().st_size else None
+        if grey is None:
+            raise DataError(f"{path}: not an image that can be decoded")
+        if grey.shape != size:
+            raise DataError(f"{path}: {grey.shape[1]}x{grey.shape[0]}, the image is {size[1]}x{size[0]}")
+        mask: NDArray[np.bool_] = grey > 0
+        return mask
+
+    def _read_detections(self, path: Path) -> dict[str, Boxes]:
+        numbers = array.array("d")  # an entry: image, left, top, right, bottom, score, class
+        index: dict[str, int] = {}
+        try:
+            for entry in _entries(path.read_text(encoding="utf-8")):
+                left, top, width, height = (float(value) for value in entry["bbox"])
+                number = self._class(int(entry["category_id"]), path)
+                score = float(entry["score"])
+                if not 0 <= score <= 1:
+                    raise DataError(f"{path}: a score must be between 0 and 1, got {score}")
+                image = index.setdefault(str(entry["image_id"]), len(index))
+                numbers.extend((image, left, top, left + width, top + height, score, number))
+        except (KeyError, TypeError, ValueError) as error:
+            if isinstance(error, DataError):
+                raise
+            form = "a list of image_id, category_id, bbox, score"
+            raise DataError(f"{path}: not COCO results ({form}): {error!r}") from error
+        table = np.frombuffer(numbers, np.float64).reshape(-1, 7) if numbers else np.zeros((0, 7))
+        table = table[np.lexsort((-table[:, 5], table[:, 0]))]
+        parts = np.split(table, np.flatnonzero(np.diff(table[:, 0])) + 1) if len(table) else []
+        return {
+            name: Boxes(part[:, 1:5].astype(np.float32), part[:, 5].astype(np.float32), part[:, 6].astype(np.int64))
+            for name, part in zip(index, parts, strict=True)
+        }
+
+    def _class(self, category: int, path: Path) -> int:
+        if len(self.class_names) == 1:
+            return 0
+        if not 1 <= category <= len(self.class_names):
+            raise DataError(
+                f"{path}: category_id {category} is not 1 to {len(self.class_names)} ({', '.join(self.class_names)})"
+            )
+        return category - 1
+
+
+def _entries(text: str) -> Iterator[dict[str, Any]]:
+    """Yield the members of a JSON list one at a time, so that millions of boxes never are as many dictionaries.
+
+    Raises:
+        ValueError: If it is not a JSON list.
+    """
+    decoder = json.JSONDecoder()
+    gap = re.compile(r"[\s,]*")
+    at = len(text) - len(text.lstrip())
+    if text[at : at + 1] != "[":
+        raise ValueError("no list")
+    at += 1
+    while True:
+        at = gap.match(text, at).end()  # type: ignore[union-attr]
+        if text[at : at + 1] == "]":
+            return
+        entry, at = decoder.raw_decode(text, at)
+        yield entry

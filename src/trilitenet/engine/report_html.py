@@ -1,0 +1,222 @@
+"""The report card as one self-contained HTML page: no script, no file beside it, light or dark as the reader likes."""
+
+from __future__ import annotations
+
+import base64
+
+from trilitenet.config import TASKS
+from trilitenet.engine.figures import CONDITION_FIGURES, HEADLINES, meaning
+from trilitenet.engine.page import bar_cell, escape, histogram_plot, line_plot, page, percent, section, table
+from trilitenet.engine.report import FEW_IMAGES, Condition, DetectionPlots, Report, WorstFrame
+from trilitenet.metrics.segmentation import SegmentationScores
+
+__all__ = ["report_page"]
+
+_KEY = (
+    '<p class="note key"><i style="background:var(--right)"></i>right<i style="background:var(--false)"></i>false'
+    '<i style="background:var(--missed)"></i>missed<i style="background:#969696"></i>ignored region</p>'
+)
+_PROTOCOLS = {
+    "fair": "Native size, one confusion matrix over the data set, COCO matching; ignored regions count neither way.",
+    "paper": "As the published evaluation: canvas size, averages over batches, recall at confidence 0.001. "
+    "Comparable with published rows only.",
+}
+
+
+def report_page(report: Report) -> str:
+    """Return the page."""
+    provenance = report.provenance
+    parts = [
+        f"<h1>{escape(provenance.model)}</h1>",
+        f'<p class="lead">{escape(provenance.runtime)} on {provenance.images} images of {escape(provenance.data)} '
+        f"{escape(provenance.split)}, {escape(provenance.started)}</p>",
+        _tiles(report),
+    ]
+    parts += [_figures(report, protocol) for protocol in report.protocols]
+    if report.plots is not None:
+        parts.append(_detection(report, report.plots))
+    parts.append(_pixels(report))
+    parts += [_conditions(report, protocol) for protocol in report.protocols]
+    parts += [_variations(report)]
+    parts += [_worst(report, task) for task in TASKS]
+    parts.append(_provenance(report))
+    return page(f"{provenance.model}: report card", "\n".join(part for part in parts if part))
+
+
+def _tiles(report: Report) -> str:
+    tiles = []
+    for key in HEADLINES:
+        figure = report.figures.get(key)
+        if figure is None:
+            continue
+        protocol, task, _ = key.split("/")
+        spread = "" if figure.low is None else f"{percent(figure.low)} to {percent(figure.high)}"
+        tiles.append(
+            f'<div class="tile"><span>{task} ({protocol})</span><b>{percent(figure.value)}</b>'
+            f"<span>{escape(meaning(key).title)}</span><span>{spread}</span></div>"
+        )
+    return f'<div class="tiles">{"".join(tiles)}</div>'
+
+
+def _figures(report: Report, protocol: str) -> str:
+    rows = []
+    last = ""
+    for key, figure in report.figures.items():
+        owner, task, _ = key.split("/")
+        if owner != protocol:
+            continue
+        words = meaning(key)
+        spread = "" if figure.low is None else f"{percent(figure.low)} to {percent(figure.high)}"
+        rows.append(
+            f"<tr><td>{task if task != last else ''}</td><td>{escape(words.title)}</td>{bar_cell(figure.value)}"
+            f'<td class="n">{spread}</td><td class="f">{escape(words.formula)}</td></tr>'
+        )
+        last = task
+    head = '<th>task</th><th>figure</th><th class="n">per cent</th><th class="n">95% interval</th><th>formula</th>'
+    body = f'<div class="card">{table(head, "".join(rows))}</div>'
+    return section(f"Figures, {protocol} protocol", body, _PROTOCOLS[protocol])
+
+
+def _detection(report: Report, plots: DetectionPlots) -> str:
+    marks = []
+    scores = None if report.fair is None else report.fair.detection
+    if scores is not None:
+        best, at = scores.best, scores.at
+        marks = [
+            (best.recall, best.precision, f"best F1 {percent(best.f1)} at {best.confidence:.2f}"),
+            (at.recall, at.precision, f"at {at.confidence:.2f}"),
+        ]
+    cards = [
+        ("Precision and recall, IoU 0.5", line_plot(plots.recall, plots.precision, "recall", "precision", marks)),
+        (
+            "Confidence of right and wrong boxes",
+            histogram_plot(plots.right, plots.wrong, "confidence")
+            + '<p class="note key"><i style="background:var(--right)"></i>right'
+            '<i style="background:var(--false)"></i>wrong (logarithmic scale)</p>',
+        ),
+        ("Confusion at the stated confidence", _confusion(plots)),
+    ]
+    body = "".join(f'<div class="card"><h3>{escape(title)}</h3>{content}</div>' for title, content in cards)
+    return section("Detection", f'<div class="grid">{body}</div>')
+
+
+def _confusion(plots: DetectionPlots) -> str:
+    names = plots.class_names
+    head = "".join(f"<th>{escape(name if name != 'background' else 'missed')}</th>" for name in names)
+    rows = []
+    for index, (name, counts) in enumerate(zip(names, plots.confusion, strict=True)):
+        last = index == len(names) - 1
+        cells = "".join(
+            "<td></td>" if last and column == index else f"<td>{count}</td>" for column, count in enumerate(counts)
+        )
+        rows.append(f"<tr><th>{escape('nothing there' if last else name)}</th>{cells}</tr>")
+    return table(f"<th>truth \\ prediction</th>{head}", "".join(rows), framed=True)
+
+
+def _pixels(report: Report) -> str:
+    if report.fair is None:
+        return ""
+    lane = None if report.fair.lane is None else report.fair.lane.as_labelled
+    cards = [
+        f'<div class="card"><h3>{title}</h3>{_pixel_table(scores)}</div>'
+        for title, scores in (("Drivable area", report.fair.drivable), ("Lane marking, as labelled", lane))
+        if scores is not None
+    ]
+    return section("Pixels", f'<div class="grid">{"".join(cards)}</div>') if cards else ""
+
+
+def _pixel_table(scores: SegmentationScores) -> str:
+    total = scores.true_positive + scores.false_positive + scores.false_negative + scores.true_negative
+
+    def cell(count: int) -> str:
+        share = percent(count / total, 2) if total else "-"
+        return f'<td>{share} %<br><span class="note">{count:,}</span></td>'.replace(",", " ")
+
+    head = "<th>truth \\ prediction</th><th>foreground</th><th>background</th>"
+    body = (
+        f"<tr><th>foreground</th>{cell(scores.true_positive)}{cell(scores.false_negative)}</tr>"
+        f"<tr><th>background</th>{cell(scores.false_positive)}{cell(scores.true_negative)}</tr>"
+    )
+    return (
+        f"{table(head, body, framed=True)}"
+        f'<p class="note">{scores.images} images count; {scores.both_empty} empty in truth and prediction and '
+        f"{scores.not_labelled} not labelled are left out.</p>"
+    )
+
+
+def _conditions(report: Report, protocol: str) -> str:
+    if not report.conditions:
+        return ""
+    keys = [key for key in CONDITION_FIGURES[protocol] if key in report.conditions[0].figures]
+    head = "".join(f'<th class="n">{key.split("/")[1]}<br>{escape(meaning(key).title)}</th>' for key in keys)
+    groups: dict[str, list[Condition]] = {}
+    for row in report.conditions:
+        groups.setdefault(row.attribute, []).append(row)
+    cards = []
+    for attribute, members in groups.items():
+        rows = "".join(
+            f'<tr{" class=few" if row.few else ""}><td>{escape(row.value)}</td><td class="n">{row.images}</td>'
+            + "".join(bar_cell(row.figures.get(key)) for key in keys)
+            + "</tr>"
+            for row in members
+        )
+        full = table(f'<th>{escape(attribute)}</th><th class="n">images</th>{head}', rows)
+        cards.append(f'<div class="card">{full}</div>')
+    return section(
+        f"By condition, {protocol} protocol",
+        f'<div class="grid">{"".join(cards)}</div>',
+        f"Per cent. Grey: under {FEW_IMAGES} images, too few to say much.",
+    )
+
+
+def _variations(report: Report) -> str:
+    """Robustness and input sizes, where they were measured."""
+    if not report.variations:
+        return ""
+    parts = []
+    for kind in dict.fromkeys(variation.kind for variation in report.variations):
+        members = [variation for variation in report.variations if variation.kind == kind]
+        keys = [key for key in HEADLINES if key in members[0].figures]
+        head = "".join(f'<th class="n">{key.split("/")[1]}<br>{escape(meaning(key).title)}</th>' for key in keys)
+        rows = "".join(
+            f"<tr><td>{escape(member.name)}</td>" + "".join(bar_cell(member.figures.get(key)) for key in keys) + "</tr>"
+            for member in members
+        )
+        parts.append(section(kind, f'<div class="card">{table(f"<th></th>{head}", rows)}</div>', members[0].note))
+    return "".join(parts)
+
+
+def _worst(report: Report, task: str) -> str:
+    frames = [frame for frame in report.worst if frame.task == task]
+    if not frames:
+        return ""
+    body = f'{_KEY}<div class="frames">{"".join(_frame(frame) for frame in frames)}</div>'
+    return section(f"Worst images: {task}", body)
+
+
+def _frame(frame: WorstFrame) -> str:
+    picture = ""
+    if frame.picture:
+        data = base64.b64encode(frame.picture).decode()
+        picture = f'<img loading="lazy" alt="{escape(frame.name)}" src="data:image/jpeg;base64,{data}">'
+    return f"<figure>{picture}<figcaption><b>{escape(frame.name)}</b><br>{escape(frame.note)}</figcaption></figure>"
+
+
+def _provenance(report: Report) -> str:
+    known = report.provenance
+    rows = [
+        ("model", known.model),
+        ("model SHA-256", known.model_sha256 or "-"),
+        ("runtime", known.runtime),
+        ("data", f"{known.data}, split {known.split}, {known.images} images"),
+        *((f"SHA-256 of {name}", value) for name, value in known.data_sha256.items()),
+        ("thresholds", ", ".join(f"{name} {value:g}" for name, value in known.thresholds.items())),
+        ("settings", ", ".join(f"{name} {value}" for name, value in known.settings.items())),
+        ("canvas", ", ".join(known.canvas)),
+        ("versions", ", ".join(f"{name} {value}" for name, value in known.versions.items())),
+        ("hardware", known.hardware),
+        ("started", known.started),
+        ("took", f"{known.seconds:.1f} s, peak memory {known.peak_memory_mib:.0f} MiB"),
+    ]
+    body = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in rows)
+    return section("Where this comes from", f'<div class="card"><dl>{body}</dl></div>')
