@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from tests.fakes import ColourBackend, coloured_scene
 
+from tests.fakes import ColourBackend, coloured_scene
 from trilitenet.config import Thresholds
 from trilitenet.errors import ConfigError, InputError
 from trilitenet.inference.backend import Backend

@@ -62,7 +62,9 @@ class Command(NamedTuple):
 
 COMMANDS: Final[tuple[Command, ...]] = (
     Command("data synthesize", "synthesize", "synthesize"),
+    Command("evaluate", "evaluate", "evaluate"),
     Command("predict", "predict", "predict"),
+    Command("score", "score", "score"),
     Command("serve", "command", "serve", package="apps.server"),
     Command("train", "train", "train"),
     Command("weights import", "weights", "import_weights"),
@@ -71,7 +73,7 @@ COMMANDS: Final[tuple[Command, ...]] = (
 
 GROUPS: Final = {
     "data": "Make, read, check and convert data sets.",
-    "weights": "Import, inspect and average weights.",
+    "weights": "Import published weights, and see what a file says of itself.",
 }
 """Words that gather commands, with their help."""
 

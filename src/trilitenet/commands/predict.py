@@ -1,0 +1,505 @@
+"""Predict on pictures, folders, videos and streams, and leave overlays and machine-readable files."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+import os
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path, PurePath
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+from trilitenet.commands.load import load
+from trilitenet.errors import BackendError, InputError, OutputError, TriLiteNetError
+from trilitenet.formats.writers.base import Writer, open_writer
+from trilitenet.inference.predictor import Predictor
+from trilitenet.inference.sources import Clip, Failure, FrameReader, Stills, find_sources
+from trilitenet.inference.video import PerceptionStream, VideoWriter
+from trilitenet.processing.drawing import PARTS, check_parts, draw
+from trilitenet.road.camera import read_camera
+from trilitenet.road.drawing import ROAD_PARTS, draw_road
+from trilitenet.road.monitor import RoadMonitor
+from trilitenet.road.structures import Road
+from trilitenet.road.tracking import Steady
+from trilitenet.structures import Perception
+
+__all__ = ["PredictReport", "RoadOptions", "predict", "predict_with"]
+
+_JPEG_QUALITY: Final = 92
+"""Of overlays on pictures, of 100."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RoadOptions:
+    """What is wanted beyond the single frame.
+
+    Attributes:
+        measure: Lanes as curves, and, with a camera, metres.
+        camera: A camera file (see `trilitenet.road.camera.read_camera`); estimated from the lanes if None.
+        track: Give vehicles identities.
+        smoothing: Weight of the past in the masks, in [0, 1).
+    """
+
+    measure: bool = False
+    camera: Path | None = None
+    track: bool = False
+    smoothing: float = 0.0
+
+    def open(self, *, still: bool) -> tuple[Steady | None, RoadMonitor | None]:
+        """Return what follows one video, or what looks at one picture.
+
+        Raises:
+            ConfigError: If the camera file is wrong, or the smoothing out of range.
+            MissingExtraError: If vehicles shall be tracked and the extra ``track`` is not installed.
+        """
+        steady = None
+        if not still and (self.track or self.smoothing):
+            steady = Steady(track=self.track, smoothing=self.smoothing)
+        camera = None if self.camera is None else read_camera(self.camera)
+        return steady, RoadMonitor(camera, still=still) if self.measure or camera is not None else None
+
+
+@dataclasses.dataclass(frozen=True)
+class PredictReport:
+    """What `predict` did.
+
+    Attributes:
+        images: Pictures seen.
+        videos: Videos and streams seen.
+        frames: Frames of videos seen.
+        seconds: Wall time, the loading of the model left out.
+        failures: What could not be used, and why.
+        files: The overlays written.
+        output: The folder of all results.
+        interrupted: Whether it was stopped by Ctrl-C; what was written until then is whole.
+    """
+
+    images: int
+    videos: int
+    frames: int
+    seconds: float
+    failures: tuple[Failure, ...]
+    files: tuple[Path, ...]
+    output: Path
+    interrupted: bool = False
+
+    @property
+    def exit_code(self) -> int:
+        """0 if all went well, 1 if anything failed, 130 if interrupted."""
+        return 130 if self.interrupted else int(bool(self.failures))
+
+    @property
+    def errors(self) -> tuple[str, ...]:
+        """One line for each source that could not be used."""
+        return tuple(failure.reason for failure in self.failures)
+
+    def summary(self) -> str:
+        """Return one line for people."""
+        done = []
+        if self.images:
+            done.append(f"{self.images} image{'s' * (self.images != 1)}")
+        if self.videos:
+            done.append(
+                f"{self.videos} video{'s' * (self.videos != 1)} of {self.frames} frame{'s' * (self.frames != 1)}"
+            )
+        speed = (self.images + self.frames) / max(self.seconds, 1e-9)
+        what = f"{', '.join(done)} at {speed:.1f} a second -> {self.output}" if done else "nothing was predicted"
+        failed = f"; {len(self.failures)} failed" if self.failures else ""
+        return f"{'interrupted: ' if self.interrupted else ''}{what}{failed}"
+
+
+def predict(
+    *sources: str,
+    output: Path = Path("predictions"),
+    model: str = "tiny",
+    device: str = "auto",
+    backend: str = "auto",
+    confidence: float | None = None,
+    format: tuple[str, ...] = ("json",),
+    overlay: bool = True,
+    hide: tuple[str, ...] = (),
+    overwrite: bool = False,
+    every: int = 1,
+    start: float = 0.0,
+    end: float | None = None,
+    max_frames: int | None = None,
+    rate: float = 30.0,
+    long_side: int | None = None,
+    batch_size: int = 4,
+    preview: bool = False,
+    quiet: bool = False,
+    road: bool = False,
+    camera: Path | None = None,
+    track: bool = False,
+    smoothing: float = 0.0,
+) -> PredictReport:
+    """Find vehicles, drivable area and lane lines in pictures, folders, videos and streams.
+
+    A source that cannot be read is named at the end, and the others are done all the same. Ctrl-C ends a video or a
+    stream cleanly: what was written until then is whole and can be played.
+
+    Args:
+        sources: Pictures, videos, folders, glob patterns, numbered pictures (frames/%06d.jpg), RTSP or HTTP URLs, a
+            camera's number (0), - for a video on standard input.
+        output: Folder for the results.
+        model: Name of shipped weights, or a file of weights.
+        device: auto (the best there is), cpu, cuda, cuda:1, mps.
+        backend: auto (what the file is for), or a runtime by name.
+        confidence: Keep boxes whose confidence is above this, in [0, 1]; the model's own if left out.
+        format: Machine-readable results, one or more: json, jsonl, scalabel, openlabel, coco, yolo, cvat, parquet, csv.
+        overlay: Write overlays: NAME.jpg for pictures, NAME.mp4 for videos.
+        hide: Parts of the overlay to leave out: drivable, lane, boxes, labels; with --road also lines, distances, above
+            (the picture from above), status.
+        overwrite: Replace results that exist.
+        every: Of a video, take every so many frames.
+        start: Of a video, begin at so many seconds.
+        end: Of a video, stop at so many seconds.
+        max_frames: Of a video, take at most so many frames.
+        rate: Frames a second of numbered pictures.
+        long_side: The longer side of an image is resized to so many pixels.
+        batch_size: At most so many images go through the network at once; live sources go one by one.
+        preview: Show the overlay in a window while it runs.
+        quiet: Show no progress.
+        road: Make curves of the lane lines and measure the road in metres: offset, heading, curvature, the vehicle
+            ahead, lane departure and collision warnings (advisory only).
+        camera: Camera file (YAML) for --road; without it, the camera is estimated from the lanes of a video.
+        track: Give vehicles an identity over the frames of a video.
+        smoothing: Weight of the past in a video's masks, from 0 (none) to below 1.
+
+    Returns:
+        What was done.
+
+    Raises:
+        OutputError: If results exist and may not be replaced (told before the work begins), or cannot be written.
+    """
+    options = RoadOptions(road, camera, track, smoothing)
+    check_parts(hide, PARTS + ROAD_PARTS)
+    options.open(still=False)  # what is wrong with them is told before any work
+    clip = Clip(every=every, start=start, end=end, max_frames=max_frames)
+    job = _Job(sources, output, clip, format, overlay=overlay, overwrite=overwrite, rate=rate)
+    with load(
+        model,
+        device=device,
+        backend=backend,
+        confidence=confidence,
+        long_side=long_side,
+        batch_size=batch_size,
+    ) as predictor:
+        return job.run(predictor, hide=hide, preview=preview, quiet=quiet, road=options)
+
+
+def predict_with(
+    predictor: Predictor,
+    sources: Sequence[str | Path],
+    output: Path,
+    *,
+    clip: Clip | None = None,
+    format: Sequence[str] = ("json",),
+    overlay: bool = True,
+    hide: Sequence[str] = (),
+    overwrite: bool = False,
+    rate: float = 30.0,
+    preview: bool = False,
+    quiet: bool = True,
+    road: RoadOptions | None = None,
+) -> PredictReport:
+    """Do what `predict` does, with a predictor at hand.
+
+    Args:
+        predictor: The predictor; it is not closed.
+        sources: As for `predict`.
+        output: Folder for the results.
+        clip: Which frames of videos are wanted.
+        format: As for `predict`.
+        overlay: As for `predict`.
+        hide: As for `predict`.
+        overwrite: As for `predict`.
+        rate: As for `predict`.
+        preview: As for `predict`.
+        quiet: As for `predict`.
+        road: What is wanted beyond the single frame.
+    """
+    check_parts(hide, PARTS + ROAD_PARTS)
+    job = _Job(sources, output, clip or Clip(), format, overlay=overlay, overwrite=overwrite, rate=rate)
+    return job.run(predictor, hide=hide, preview=preview, quiet=quiet, road=road)
+
+
+class _Job:
+    """Sources and the names of their results; made, and refused, before any work begins."""
+
+    def __init__(
+        self,
+        sources: Sequence[str | Path],
+        output: Path,
+        clip: Clip,
+        formats: Sequence[str],
+        *,
+        overlay: bool,
+        overwrite: bool,
+        rate: float,
+    ) -> None:
+        if not sources:
+            raise InputError("no source was given: name a picture, a folder, a video, a URL or a camera's number")
+        self.output = output
+        self.overlay = overlay
+        self.clip = clip
+        self.sources, self.failures = find_sources(sources, clip, rate=rate)
+        names = [name for source in self.sources for name in _names(source)]
+        self.stems = _allot_stems(names)
+        self._check_output(names, overwrite=overwrite)
+        self.writers: list[Writer] = []
+        with _writing(output):
+            output.mkdir(parents=True, exist_ok=True)
+            for name in dict.fromkeys(formats):
+                self.writers.append(open_writer(name, output, overwrite=overwrite))
+        for writer in self.writers:  # the same names as the overlays, whichever source fails
+            for name in names:
+                writer.stem(Perception(size=(1, 1), source=name))
+        self.images = self.videos = self.frames = 0
+        self.files: list[Path] = []
+
+    def _check_output(self, names: Sequence[str], *, overwrite: bool) -> None:
+        if self.output.exists() and not self.output.is_dir():
+            raise OutputError(f"{self.output}: is a file; give a folder for --output")
+        originals = {Path(name).resolve() for name in names if Path(name).exists()}
+        stems = set(self.stems.values())
+        for folder in (self.output, self.output / "labels"):
+            for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+                if path.stem in stems and path.is_file():
+                    if path.resolve() in originals:
+                        raise OutputError(f"{path}: results would lie beside their source; choose another --output")
+                    if not overwrite:
+                        raise OutputError(f"{path}: exists already; choose another --output or add --overwrite")
+
+    def run(
+        self,
+        predictor: Predictor,
+        *,
+        hide: Sequence[str] = (),
+        preview: bool = False,
+        quiet: bool = False,
+        road: RoadOptions | None = None,
+    ) -> PredictReport:
+        """Do the work."""
+        self.road = road or RoadOptions()
+        window = _Window() if preview else None
+        began = time.perf_counter()
+        interrupted = False
+        with contextlib.ExitStack() as stack:
+            for writer in self.writers:
+                stack.enter_context(writer)
+            stack.enter_context(_writing(self.output))
+            progress = stack.enter_context(_show_progress(quiet))
+            if window is not None:
+                stack.enter_context(contextlib.closing(window))
+            try:
+                for source in self.sources:
+                    self._run_source(source, predictor, progress, hide, window)
+            except (KeyboardInterrupt, _WindowClosed):
+                interrupted = True
+        return PredictReport(
+            images=self.images,
+            videos=self.videos,
+            frames=self.frames,
+            seconds=time.perf_counter() - began,
+            failures=tuple(self.failures),
+            files=tuple(self.files),
+            output=self.output,
+            interrupted=interrupted,
+        )
+
+    def _run_source(
+        self,
+        source: Stills | FrameReader,
+        predictor: Predictor,
+        progress: Progress,
+        hide: Sequence[str],
+        window: _Window | None,
+    ) -> None:
+        name = "images" if isinstance(source, Stills) else PurePath(source.name).name
+        total = len(source.paths) if isinstance(source, Stills) else source.expected
+        task = progress.add_task(name, total=total)
+        video: VideoWriter | None = None
+        with contextlib.ExitStack() as stack:
+            if isinstance(source, FrameReader):
+                self.videos += 1
+                if self.overlay:
+                    rate = None if source.rate is None else source.rate / self.clip.every
+                    video = VideoWriter(self.output / f"{self.stems[source.name]}.mp4", rate)
+                    stack.enter_context(video)
+            follow = self.road.open(still=False) if isinstance(source, FrameReader) else None
+            stream = stack.enter_context(PerceptionStream(source, predictor))
+            try:
+                for item in stream:
+                    if isinstance(item, Failure):
+                        self.failures.append(item)
+                    else:
+                        perception, road = _follow(item, follow or self.road.open(still=True))
+                        self._take(perception, road, video, hide, window)
+                    progress.advance(task)
+            except InputError as error:
+                assert isinstance(source, FrameReader)
+                self.failures.append(Failure(source.name, str(error)))
+                self.videos -= video is None or not video.frames
+        if video is not None and video.frames:
+            self.files.append(video.path)
+        progress.update(task, total=progress.tasks[task].completed)
+
+    def _take(
+        self,
+        perception: Perception,
+        road: Road | None,
+        video: VideoWriter | None,
+        hide: Sequence[str],
+        window: _Window | None,
+    ) -> None:
+        """Draw and write one perception."""
+        if self.overlay or window is not None:
+            assert perception.image is not None
+            # The frame is ours alone from here on: drawing on it saves a copy.
+            picture = draw(perception, hide=[part for part in hide if part in PARTS], out=perception.image)
+            if road is not None:
+                draw_road(picture, perception, road, hide=[part for part in hide if part in ROAD_PARTS])
+            if video is not None:
+                video.write(picture, perception.timestamp)
+            elif self.overlay and perception.frame is None:
+                assert perception.source is not None
+                path = self.output / f"{self.stems[perception.source]}.jpg"
+                _write_jpeg(path, picture)
+                self.files.append(path)
+            if window is not None:
+                window.show(picture)
+        for writer in self.writers:
+            writer.write(perception, None if road is None else road.to_dict())
+        if perception.frame is None:
+            self.images += 1
+        else:
+            self.frames += 1
+
+
+def _follow(
+    perception: Perception, parts: tuple[Steady | None, RoadMonitor | None]
+) -> tuple[Perception, Road | None]:
+    """Return a perception with what its video adds to it, and its road."""
+    steady, monitor = parts
+    if steady is not None:
+        perception = steady(perception)
+    return perception, None if monitor is None else monitor(perception)
+
+
+def _names(source: Stills | FrameReader) -> list[str]:
+    return [str(path) for path in source.paths] if isinstance(source, Stills) else [source.name]
+
+
+def _allot_stems(names: Sequence[str]) -> dict[str, str]:
+    """Return a file name without ending for each source; the second ``a`` becomes ``a-2``."""
+    stems: dict[str, str] = {}
+    for name in names:
+        stem = PurePath(name).stem or "image"
+        number, chosen = 1, stem
+        while chosen in stems.values():
+            number += 1
+            chosen = f"{stem}-{number}"
+        stems.setdefault(name, chosen)
+    return stems
+
+
+def _write_jpeg(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write (height, width, 3) uint8 RGB so that the file is whole or not there."""
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    if not done:
+        raise OutputError(f"{path}: the overlay cannot be encoded as JPEG")
+    handle, partial = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data.tobytes())
+        Path(partial).chmod(0o644)
+        Path(partial).replace(path)
+    except BaseException:
+        Path(partial).unlink(missing_ok=True)
+        raise
+
+
+@contextlib.contextmanager
+def _writing(output: Path) -> Iterator[None]:
+    """Tell what the system says on writing, such as that the disk is full, in one line."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, TriLiteNetError):
+            raise
+        raise OutputError(f"{error.filename or output}: cannot be written ({error.strerror or error})") from error
+
+
+class _Speed(ProgressColumn):
+    """Frames a second, over the last seconds."""
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{speed:.1f}/s")
+
+
+@contextlib.contextmanager
+def _show_progress(quiet: bool) -> Iterator[Progress]:
+    """Show progress on the terminal, if there is one; messages of the log go above it."""
+    console = Console(stderr=True)
+    progress = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        _Speed(),
+        TimeRemainingColumn(),
+        console=console,
+        disable=quiet or not console.is_terminal,
+    )
+    if progress.disable:
+        yield progress
+        return
+    log = logging.getLogger("trilitenet")
+    handler = RichHandler(console=console, show_time=False, show_path=False)
+    log.addHandler(handler)
+    propagate, log.propagate = log.propagate, False
+    try:
+        with progress:
+            yield progress
+    finally:
+        log.removeHandler(handler)
+        log.propagate = propagate
+
+
+class _WindowClosed(Exception):  # noqa: N818 - a request, not an error
+    """The user closed the preview."""
+
+
+class _Window:
+    """The live preview; q or Escape ends the run."""
+
+    _TITLE = "trilitenet"
+
+    def __init__(self) -> None:
+        try:
+            cv2.namedWindow(self._TITLE, cv2.WINDOW_NORMAL)
+        except cv2.error as error:
+            raise BackendError(
+                "this OpenCV has no windows; for --preview: pip uninstall opencv-python-headless, then "
+                "pip install opencv-python"
+            ) from error
+
+    def show(self, image: NDArray[np.uint8]) -> None:
+        cv2.imshow(self._TITLE, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+        if cv2.waitKey(1) & 0xFF in (ord("q"), 27):
+            raise _WindowClosed
+
+    def close(self) -> None:
+        cv2.destroyWindow(self._TITLE)

@@ -1,0 +1,542 @@
+"""Where frames come from: pictures, folders, video files, streams, cameras, numbered pictures, standard input.
+
+What a user names becomes a list of `Stills` and frame readers. A reader gives `Frame` after `Frame` with its index and
+time stamp, applies `Clip`, and never holds more than a few frames.
+"""
+
+from __future__ import annotations
+
+import abc
+import contextlib
+import dataclasses
+import functools
+import glob
+import logging
+import re
+import sys
+import threading
+import time
+import urllib.parse
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.errors import ConfigError, InputError, import_extra
+from trilitenet.processing.images import read_image
+
+__all__ = [
+    "VIDEO_SUFFIXES",
+    "CameraReader",
+    "Clip",
+    "Failure",
+    "Frame",
+    "FrameReader",
+    "SequenceReader",
+    "Stills",
+    "StreamReader",
+    "VideoReader",
+    "find_sources",
+]
+
+VIDEO_SUFFIXES: Final = frozenset(
+    {
+        ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".m2ts", ".mts", ".wmv", ".flv",
+        ".3gp", ".ogv", ".gif", ".h264", ".264", ".hevc", ".h265", ".mjpeg", ".y4m",
+    }
+)  # fmt: skip
+"""File name endings, in lower case, that are taken for videos."""
+
+_LOGGER: Final = logging.getLogger(__name__)
+_NUMBERED: Final = re.compile(r"%0?(\d*)d")
+_Decoded: TypeAlias = tuple[float, Callable[[], NDArray[np.uint8]]]
+"""Seconds from the start, and what makes the RGB image of it (not called for frames that are left out)."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Frame:
+    """One picture on its way to the network.
+
+    Attributes:
+        image: (height, width, 3) uint8 RGB, upright.
+        source: The path, URL or name it came from.
+        index: Position in the video, from 0; None for a still picture.
+        timestamp: Seconds from the start of the video; None for a still picture.
+    """
+
+    image: NDArray[np.uint8]
+    source: str
+    index: int | None = None
+    timestamp: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Failure:
+    """A source that could not be used.
+
+    Attributes:
+        source: Its name.
+        reason: One line that begins with the name.
+    """
+
+    source: str
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Clip:
+    """Which frames of a video are wanted.
+
+    Attributes:
+        every: Every so many frames, from the first.
+        start: Seconds from the start of the video.
+        end: Seconds from the start of the video, exclusive; None for all.
+        max_frames: At most so many; None for all.
+
+    Raises:
+        ConfigError: If a value is out of range.
+    """
+
+    every: int = 1
+    start: float = 0.0
+    end: float | None = None
+    max_frames: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.every < 1 or (self.max_frames is not None and self.max_frames < 1):
+            raise ConfigError(f"every and max_frames must be at least 1, got {self.every} and {self.max_frames}")
+        if self.start < 0 or (self.end is not None and self.end <= self.start):
+            raise ConfigError(f"start must be at least 0 and end after it, got {self.start} and {self.end}")
+
+    def expected(self, frames: int | None, rate: float | None) -> int | None:
+        """Return about how many frames remain of a video of so many, at so many a second; None if unknown."""
+        if frames is not None and rate:
+            last = frames if self.end is None else min(frames, round(self.end * rate))
+            wanted = -(-max(0, last - round(self.start * rate)) // self.every)
+            return wanted if self.max_frames is None else min(wanted, self.max_frames)
+        return self.max_frames
+
+
+class FrameReader(abc.ABC):
+    """Frames of one video, stream or camera, one after the other.
+
+    Args:
+        name: What it is called in results.
+        clip: Which frames are wanted.
+
+    Attributes:
+        live: Whether frames come at their own pace, so that one not taken in time is lost.
+        rate: Frames a second as the source states it, before ``clip.every``; None if unknown.
+        expected: About how many frames it will give; None if unknown.
+        broken: Frames so far that could not be decoded and were left out.
+    """
+
+    live = False
+
+    def __init__(self, name: str, clip: Clip | None = None) -> None:
+        self.name = name
+        self.clip = clip or Clip()
+        self.rate: float | None = None
+        self.expected: int | None = None
+        self.broken = 0
+        self._closed = threading.Event()
+
+    def close(self) -> None:
+        """Stop waiting for a stream to come back; from any thread."""
+        self._closed.set()
+
+    def __iter__(self) -> Iterator[Frame]:
+        given = seen = 0
+        with contextlib.closing(self._decode()) as decoded:
+            for timestamp, make in decoded:
+                # To a microsecond: a frame at 1/3 s is not before a start of 0.333333.
+                if timestamp < self.clip.start - 1e-6:
+                    continue
+                if self.clip.end is not None and timestamp >= self.clip.end - 1e-6:
+                    break
+                seen += 1
+                if (seen - 1) % self.clip.every:
+                    continue
+                yield Frame(make(), self.name, self._index(timestamp, seen - 1), timestamp)
+                given += 1
+                if given == self.clip.max_frames:
+                    break
+        if not given:
+            part = "" if self.clip.start == 0 and self.clip.end is None else " between --start and --end"
+            raise InputError(f"{self.name}: has no frames that can be decoded{part}")
+
+    def _index(self, timestamp: float, seen: int) -> int:
+        """Return the position in the video: counted, or by time if the beginning was skipped."""
+        return seen + round(self.clip.start * self.rate) if self.clip.start and self.rate else seen
+
+    @abc.abstractmethod
+    def _decode(self) -> Any:
+        """Yield `_Decoded` in order, as a generator."""
+
+
+class VideoReader(FrameReader):
+    """A video file, or standard input, by PyAV.
+
+    Rotation noted in the file is applied, time stamps are the file's own (so that a variable frame rate is kept), and a
+    frame that cannot be decoded is left out and counted.
+
+    Args:
+        path: The file, or ``"-"`` for standard input.
+        clip: Which frames are wanted.
+
+    Raises:
+        InputError: If it is missing, empty, or no video.
+        MissingExtraError: If PyAV is not installed.
+    """
+
+    def __init__(self, path: str | Path, clip: Clip | None = None) -> None:
+        super().__init__("stdin" if str(path) == "-" else _without_secrets(str(path)), clip)
+        self._path = str(path)
+        if self._path != "-":
+            with _open_container(self._path, self.name) as container:
+                stream = container.streams.video[0]
+                rate = stream.average_rate or stream.guessed_rate
+                self.rate = float(rate) if rate else None
+                frames = stream.frames or None
+                if frames is None and container.duration and self.rate:
+                    frames = round(container.duration / 1e6 * self.rate)
+                self.expected = self.clip.expected(frames, self.rate)
+
+    def _decode(self) -> Any:
+        with _open_container(self._path, self.name) as container:
+            if self.clip.start and self._path != "-":
+                stream = container.streams.video[0]
+                first = stream.start_time or 0
+                with contextlib.suppress(_av().FFmpegError):  # what cannot seek is read from its beginning
+                    container.seek(first + int(self.clip.start / stream.time_base), stream=stream)
+            yield from _frames_of(container, self)
+        if self.broken:
+            _LOGGER.warning("%s: %d broken frames were left out", self.name, self.broken)
+
+
+class StreamReader(FrameReader):
+    """A live stream by URL (RTSP, HTTP, RTMP, UDP ...), picked up again when it breaks or ends.
+
+    After a break it waits ``backoff`` seconds, then twice as long each time, up to ``longest``; a frame that arrives
+    starts the count anew. Time stamps go on over a break by the clock.
+
+    Args:
+        url: The address.
+        clip: Which frames are wanted.
+        retries: Give up after so many attempts in a row that brought no frame.
+        backoff: Seconds before the first new attempt.
+        longest: Seconds between attempts at most.
+        timeout: Seconds without data that count as a break.
+
+    Attributes:
+        reconnections: How often it was picked up again.
+    """
+
+    live = True
+
+    def __init__(
+        self,
+        url: str,
+        clip: Clip | None = None,
+        *,
+        retries: int = 8,
+        backoff: float = 0.5,
+        longest: float = 30.0,
+        timeout: float = 10.0,
+    ) -> None:
+        super().__init__(_without_secrets(url), clip)
+        self._url = url
+        self.expected = self.clip.expected(None, None)
+        self.retries, self.backoff, self.longest, self.timeout = retries, backoff, longest, timeout
+        self.reconnections = 0
+
+    def _decode(self) -> Any:
+        began: float | None = None
+        attempt, connected = 0, False
+        reason = "no frames came"
+        while attempt <= self.retries:
+            if attempt:
+                wait = min(self.longest, self.backoff * 2 ** (attempt - 1))
+                _LOGGER.warning("%s: %s; trying again in %.1f s", self.name, reason, wait)
+                if self._closed.wait(wait):
+                    return
+            attempt += 1
+            try:
+                with _open_container(self._url, self.name, timeout=self.timeout) as container:
+                    offset: float | None = None
+                    for timestamp, make in _frames_of(container, self):
+                        if offset is None:
+                            began = time.monotonic() if began is None else began
+                            offset = time.monotonic() - began - timestamp
+                            self.reconnections += connected
+                            connected, attempt = True, 1
+                        yield timestamp + offset, make
+                reason = "the stream ended"
+            except InputError as error:
+                if not connected and attempt == 1:
+                    raise
+                reason = str(error).removeprefix(f"{self.name}: ")
+        _LOGGER.warning("%s: given up after %d attempts (%s)", self.name, self.retries, reason)
+
+
+class CameraReader(FrameReader):
+    """A camera of this machine, by its number.
+
+    Args:
+        number: 0 for the first.
+        clip: Which frames are wanted.
+
+    Raises:
+        InputError: If it is not there.
+    """
+
+    live = True
+
+    def __init__(self, number: int, clip: Clip | None = None) -> None:
+        super().__init__(f"camera-{number}", clip)
+        self._number = number
+        self.expected = self.clip.expected(None, None)
+
+    def _decode(self) -> Any:
+        camera = cv2.VideoCapture(self._number)
+        try:
+            if not camera.isOpened():
+                raise InputError(f"{self.name}: there is no such camera, or another program holds it")
+            self.rate = camera.get(cv2.CAP_PROP_FPS) or None
+            began: float | None = None
+            while True:
+                taken, bgr = camera.read()
+                if not taken:
+                    return
+                began = time.monotonic() if began is None else began
+                yield time.monotonic() - began, functools.partial(cv2.cvtColor, bgr, cv2.COLOR_BGR2RGB)
+        finally:
+            camera.release()
+
+
+class SequenceReader(FrameReader):
+    """Numbered pictures as one video: ``frames/%06d.jpg``. Gaps in the numbers are skipped.
+
+    In results it is called what stands before the number: ``frames``.
+
+    Args:
+        pattern: A path with one ``%d``, as C's printf takes it.
+        clip: Which frames are wanted.
+        rate: Frames a second.
+
+    Raises:
+        InputError: If no file matches.
+    """
+
+    def __init__(self, pattern: str, clip: Clip | None = None, *, rate: float = 30.0) -> None:
+        place = _NUMBERED.search(pattern)
+        if place is None:
+            raise ConfigError(f"{pattern}: a pattern of numbered pictures has one %d, such as frames/%06d.jpg")
+        before, after = pattern[: place.start()], pattern[place.end() :]
+        digits = int(place.group(1) or 1)
+        if rate <= 0:
+            raise ConfigError(f"the frame rate must be positive, got {rate}")
+        super().__init__(before.rstrip("/\\_-. ") or "sequence", clip)
+        self.rate = rate
+        exact = re.compile(rf"{re.escape(before)}(\d{{{digits},}}){re.escape(after)}\Z")
+        numbered = {
+            int(match.group(1)): Path(path)
+            for path in glob.glob(f"{glob.escape(before)}*{glob.escape(after)}")  # noqa: PTH207 - a pattern
+            if (match := exact.match(path))
+        }
+        if not numbered:
+            raise InputError(f"{pattern}: no file matches")
+        self._paths = [numbered[number] for number in sorted(numbered)]
+        self.expected = self.clip.expected(len(self._paths), rate)
+
+    def _decode(self) -> Any:
+        assert self.rate is not None
+        for number, path in enumerate(self._paths):
+            timestamp = number / self.rate
+            if timestamp < self.clip.start - 1e-6:
+                continue
+            try:
+                image = read_image(path)
+            except InputError as error:
+                self.broken += 1
+                _LOGGER.warning("%s", error)
+                continue
+            yield timestamp, functools.partial(np.asarray, image)
+
+
+@dataclasses.dataclass(frozen=True)
+class Stills:
+    """Single pictures, read one by one; one that cannot be read becomes a `Failure` in its place.
+
+    Attributes:
+        paths: The files.
+    """
+
+    paths: tuple[Path, ...]
+
+    def __iter__(self) -> Iterator[Frame | Failure]:
+        for path in self.paths:
+            try:
+                yield Frame(read_image(path), str(path))
+            except InputError as error:
+                yield Failure(str(path), str(error))
+
+
+def find_sources(
+    names: Sequence[str | Path], clip: Clip | None = None, *, rate: float = 30.0
+) -> tuple[list[Stills | FrameReader], list[Failure]]:
+    """Turn what a user names into sources.
+
+    Args:
+        names: Pictures, videos, folders (all the files directly in them, but hidden ones), glob patterns, numbered
+            pictures (``%06d``), URLs, a camera's number, ``-`` for standard input.
+        clip: Which frames of videos are wanted.
+        rate: Frames a second of numbered pictures.
+
+    Returns:
+        The sources in order, neighbouring pictures together; and what cannot be used.
+    """
+    sources: list[Stills | FrameReader] = []
+    failures: list[Failure] = []
+    stills: list[Path] = []
+
+    def add(make: Callable[[], FrameReader], name: str) -> None:
+        if stills:
+            sources.append(Stills(tuple(stills)))
+            stills.clear()
+        try:
+            sources.append(make())
+        except InputError as error:
+            failures.append(Failure(name, str(error)))
+
+    for name in map(str, names):
+        if re.match(r"[a-z][a-z0-9+.-]+://", name, re.IGNORECASE):
+            add(functools.partial(_open_url, name, clip), name)
+        elif name == "-":
+            add(functools.partial(VideoReader, "-", clip), "stdin")
+        elif name.isdecimal() and not Path(name).exists():
+            add(functools.partial(CameraReader, int(name), clip), name)
+        elif _NUMBERED.search(name) and not Path(name).exists():
+            add(functools.partial(SequenceReader, name, clip, rate=rate), name)
+        else:
+            try:
+                paths = _expand(name)
+            except InputError as error:
+                failures.append(Failure(name, str(error)))
+                continue
+            for path in paths:
+                if path.suffix.lower() in VIDEO_SUFFIXES:
+                    add(functools.partial(VideoReader, path, clip), str(path))
+                else:
+                    stills.append(path)
+    if stills:
+        sources.append(Stills(tuple(stills)))
+    return sources, failures
+
+
+def _open_url(url: str, clip: Clip | None) -> FrameReader:
+    """Return a reader of a file behind an HTTP URL, which has an end, or of a live stream."""
+    if url.lower().startswith("http"):
+        with _open_container(url, _without_secrets(url), timeout=10.0) as container:
+            if container.duration:
+                return VideoReader(url, clip)
+    return StreamReader(url, clip)
+
+
+def _without_secrets(url: str) -> str:
+    """Return a URL without user, password and query, which have no place in results; anything else as it is."""
+    parts = urllib.parse.urlsplit(url)
+    if "://" not in url or not parts.netloc:
+        return url
+    return urllib.parse.urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
+
+
+def _expand(name: str) -> list[Path]:
+    """Return the files that a path or a pattern stands for, in natural order (2 before 10)."""
+    path = Path(name)
+    if path.is_dir():
+        files = [child for child in path.iterdir() if child.is_file() and not child.name.startswith(".")]
+        if not files:
+            raise InputError(f"{name}: is an empty folder")
+    elif path.exists():
+        return [path]
+    elif glob.has_magic(name):
+        matches = glob.glob(name, recursive=True)  # noqa: PTH207 - a pattern, not a folder
+        files = [Path(match) for match in matches if Path(match).is_file()]
+        if not files:
+            raise InputError(f"{name}: no file matches")
+    else:
+        raise InputError(f"{name}: no such file or folder")
+    return sorted(files, key=lambda file: [int(t) if t.isdecimal() else t for t in re.split(r"(\d+)", str(file))])
+
+
+def _av() -> Any:
+    return import_extra("av", "video")
+
+
+def _open_container(path: str, name: str, *, timeout: float | None = None) -> Any:
+    """Open what has a video stream.
+
+    Raises:
+        InputError: If that fails; one line, with the name.
+    """
+    av = _av()
+    options = {"rtsp_transport": "tcp"} if path.lower().startswith("rtsp") else {}
+    if path != "-" and timeout is None and Path(path).is_file() and not Path(path).stat().st_size:
+        raise InputError(f"{name}: is empty")
+    try:
+        container = av.open(sys.stdin.buffer if path == "-" else path, options=options, timeout=timeout)
+    except (av.FFmpegError, OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{name}: is not a video that can be read ({reason})") from error
+    if not container.streams.video:
+        container.close()
+        raise InputError(f"{name}: has no video stream")
+    container.streams.video[0].thread_type = "AUTO"
+    return container
+
+
+def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
+    """Yield the frames of the first video stream, those that cannot be decoded left out and counted."""
+    av = _av()
+    stream = container.streams.video[0]
+    step = 1 / (reader.rate or float(stream.average_rate or 0) or 30.0)
+    first = float(stream.start_time * stream.time_base) if stream.start_time is not None else None
+    last = -step
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets)
+        except StopIteration:
+            return
+        except av.FFmpegError as error:  # the file ends in the middle, or the connection is lost
+            if reader.live:
+                raise InputError(f"{reader.name}: the stream broke ({error.strerror})") from error
+            reader.broken += 1
+            return
+        try:
+            frames = packet.decode()
+        except av.FFmpegError:
+            reader.broken += 1
+            continue
+        for frame in frames:
+            if frame.is_corrupt:
+                reader.broken += 1
+                continue
+            seconds = frame.time
+            if seconds is None:
+                timestamp = last + step
+            else:
+                first = seconds if first is None else first
+                timestamp = seconds - first
+            last = timestamp
+            yield timestamp, functools.partial(_upright, frame)
+
+
+def _upright(frame: Any) -> NDArray[np.uint8]:
+    image: NDArray[np.uint8] = frame.to_ndarray(format="rgb24")
+    turns = round(frame.rotation / 90) % 4
+    return np.ascontiguousarray(np.rot90(image, turns)) if turns else image

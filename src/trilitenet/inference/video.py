@@ -1,0 +1,308 @@
+"""Video, end to end: a bounded pipeline of threads, and the encoder at its end.
+
+    reader -> [decode] -> bounded queue -> [infer] -> bounded queue -> caller (draws, writes) -> [encode]
+
+Names in brackets are threads. Each waits only for its neighbours, and no queue grows: memory stays flat whatever the
+length of the video.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import queue
+import threading
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Generic, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.errors import OutputError, import_extra
+from trilitenet.inference.predictor import Predictor
+from trilitenet.inference.sources import Failure, Frame, FrameReader, Stills
+from trilitenet.structures import Perception
+
+__all__ = ["PerceptionStream", "Prefetch", "VideoWriter"]
+
+T = TypeVar("T")
+
+_CLOCK: Final = 90_000
+"""Ticks a second of the time stamps in written videos."""
+
+
+class Prefetch(Generic[T]):
+    """Iterates over something in a thread of its own, a bounded number of items ahead.
+
+    Args:
+        items: What to iterate over; a generator is closed in the thread that ran it.
+        size: At most so many items wait.
+        drop_oldest: When full, forget the oldest instead of waiting: for live sources.
+
+    Attributes:
+        dropped: Items forgotten so far.
+    """
+
+    def __init__(self, items: Iterable[T], size: int, *, drop_oldest: bool = False) -> None:
+        self.dropped = 0
+        self._size = size
+        self._drop_oldest = drop_oldest
+        self._waiting: deque[T] = deque()
+        self._changed = threading.Condition()
+        self._ended = False
+        self._stopped = False
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, args=(iter(items),), daemon=True)
+        self._thread.start()
+
+    def __iter__(self) -> Iterator[T]:
+        return self
+
+    def __next__(self) -> T:
+        with self._changed:
+            while not (self._waiting or self._ended or self._stopped):
+                self._changed.wait(0.5)  # a bounded wait, so that Ctrl-C gets through on every system
+            if self._waiting and not self._stopped:
+                item = self._waiting.popleft()
+                self._changed.notify_all()
+                return item
+            error, self._error = self._error, None
+        if error is not None and not self._stopped:
+            raise error
+        raise StopIteration
+
+    def close(self) -> None:
+        """Stop; what waits is forgotten. Returns when the thread has ended."""
+        with self._changed:
+            self._stopped = True
+            self._waiting.clear()
+            self._changed.notify_all()
+        self._thread.join(timeout=30)
+
+    def _run(self, items: Iterator[T]) -> None:
+        try:
+            for item in items:
+                with self._changed:
+                    while len(self._waiting) >= self._size and not self._stopped:
+                        if self._drop_oldest:
+                            self._waiting.popleft()
+                            self.dropped += 1
+                        else:
+                            self._changed.wait()
+                    if self._stopped:
+                        break
+                    self._waiting.append(item)
+                    self._changed.notify_all()
+        except BaseException as error:  # handed over to whoever iterates
+            self._error = error
+        finally:
+            close = getattr(items, "close", None)
+            if close is not None:
+                with contextlib.suppress(Exception):
+                    close()
+            with self._changed:
+                self._ended = True
+                self._changed.notify_all()
+
+
+class PerceptionStream:
+    """What a predictor sees in a source, in order: reading and inference run ahead in two threads.
+
+    Use it as a context manager, so that the threads end with the block. A live source never piles up: frames that come
+    while the network is busy are left out.
+
+    Args:
+        source: Pictures, or the frames of a video.
+        predictor: The predictor; frames of a file go through it ``predictor.batch_size`` at a time.
+        ahead: Batches that may wait between two stages.
+    """
+
+    def __init__(self, source: Stills | FrameReader, predictor: Predictor, *, ahead: int = 2) -> None:
+        self._source = source
+        live = isinstance(source, FrameReader) and source.live
+        batch_size = 1 if live else predictor.batch_size
+        items: Iterable[Frame | Failure] = source
+        self._frames = Prefetch(items, 1 if live else ahead * batch_size, drop_oldest=live)
+        self._perceptions = Prefetch(_perceive(self._frames, predictor, batch_size), ahead * batch_size)
+
+    @property
+    def dropped(self) -> int:
+        """Frames of a live source that were left out so far."""
+        return self._frames.dropped
+
+    def __iter__(self) -> Iterator[Perception | Failure]:
+        return self._perceptions
+
+    def close(self) -> None:
+        """End both threads."""
+        if isinstance(self._source, FrameReader):
+            self._source.close()
+        self._frames.close()
+        self._perceptions.close()
+
+    def __enter__(self) -> PerceptionStream:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _perceive(
+    items: Iterable[Frame | Failure], predictor: Predictor, batch_size: int
+) -> Iterator[Perception | Failure]:
+    """Yield a perception for each frame, in order; failures pass through."""
+    batch: list[Frame | Failure] = []
+    for item in items:
+        batch.append(item)
+        if len(batch) == batch_size:
+            yield from _perceive_batch(batch, predictor)
+            batch = []
+    yield from _perceive_batch(batch, predictor)
+
+
+def _perceive_batch(batch: Sequence[Frame | Failure], predictor: Predictor) -> Iterator[Perception | Failure]:
+    frames = [item for item in batch if isinstance(item, Frame)]
+    perceptions = iter(predictor.perceive([frame.image for frame in frames], [frame.source for frame in frames]))
+    for item in batch:
+        if isinstance(item, Failure):
+            yield item
+        else:
+            yield dataclasses.replace(next(perceptions), frame=item.index, timestamp=item.timestamp)
+
+
+class VideoWriter:
+    """Writes an H.264 video that every browser plays (yuv420p, index at the front), encoding in a thread of its own.
+
+    The file gets its name when it is whole; until then it ends in ``.part``. Frames keep their time stamps, so a
+    variable frame rate stays one. Odd sides are made even by repeating the last row or column.
+
+    Args:
+        path: The ``.mp4`` file.
+        rate: Frames a second, for time stamps that are missing and for the encoder's rate control.
+        quality: Constant rate factor, 0 (best) to 51.
+        preset: x264's trade of speed for size.
+        ahead: Frames that may wait for the encoder.
+
+    Raises:
+        MissingExtraError: If PyAV is not installed.
+    """
+
+    def __init__(
+        self, path: Path, rate: float | None = None, *, quality: int = 23, preset: str = "veryfast", ahead: int = 8
+    ) -> None:
+        self._av = import_extra("av", "video")
+        self.path = path
+        self.frames = 0
+        self._partial = path.with_name(f"{path.name}.part")
+        self._rate = rate or 30.0
+        self._options = {"crf": str(quality), "preset": preset}
+        self._size: tuple[int, int] | None = None
+        self._container: Any = None
+        self._stream: Any = None
+        self._last = -1
+        self._waiting: queue.Queue[tuple[NDArray[np.uint8], float] | None] = queue.Queue(ahead)
+        self._error: OutputError | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def write(self, image: NDArray[np.uint8], timestamp: float | None = None) -> None:
+        """Add a frame. The array must not be changed afterwards.
+
+        Args:
+            image: (height, width, 3) uint8 RGB; brought to the size of the first frame if it differs.
+            timestamp: Seconds from the start; by the frame rate if left out.
+
+        Raises:
+            OutputError: If the file cannot be written; at this frame or a later one.
+        """
+        if self._error is not None:
+            raise self._error
+        self._waiting.put((image, self.frames / self._rate if timestamp is None else timestamp))
+        self.frames += 1
+
+    def close(self) -> None:
+        """Encode what waits, finish the file and give it its name. Without a frame there is no file.
+
+        Raises:
+            OutputError: If the file cannot be written; then it is removed.
+        """
+        if self._thread.is_alive():
+            self._waiting.put(None)
+            self._thread.join()
+        if self._error is not None:
+            raise self._error
+
+    def abort(self) -> None:
+        """Forget the file."""
+        with contextlib.suppress(OutputError):
+            self.close()
+        self.path.unlink(missing_ok=True)
+
+    def __enter__(self) -> VideoWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Finish the file: also when the block was left by an error or Ctrl-C, so that what there is can be played."""
+        self.close()
+
+    def _run(self) -> None:
+        item: tuple[NDArray[np.uint8], float] | None = None
+        try:
+            while (item := self._waiting.get()) is not None:
+                self._encode(*item)
+            if self._container is not None:
+                self._mux(None)
+                self._container.close()
+                self._partial.replace(self.path)
+        except (self._av.FFmpegError, OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or str(error)
+            self._error = OutputError(f"{self.path}: the video cannot be written ({reason})")
+            if self._container is not None:
+                with contextlib.suppress(self._av.FFmpegError, OSError, ValueError):
+                    self._container.close()
+            with contextlib.suppress(OSError):
+                self._partial.unlink(missing_ok=True)
+            while item is not None:  # so that nobody waits for a place in the queue for ever
+                item = self._waiting.get()
+
+    def _encode(self, image: NDArray[np.uint8], timestamp: float) -> None:
+        if self._container is None:
+            self._open(image.shape[0], image.shape[1])
+        assert self._size is not None
+        height, width = self._size
+        if image.shape[:2] != (height, width):
+            image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        if height % 2 or width % 2:
+            image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+        # OpenCV's conversion (BT.601, 16 .. 235, as the stream says) is several times quicker than swscale's.
+        planes = cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420)
+        frame = self._av.VideoFrame.from_ndarray(planes, format="yuv420p")
+        self._last = max(self._last + 1, round(timestamp * _CLOCK))
+        frame.pts, frame.time_base = self._last, Fraction(1, _CLOCK)
+        self._mux(frame)
+
+    def _open(self, height: int, width: int) -> None:
+        self._size = (height, width)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._container = self._av.open(str(self._partial), "w", format="mp4", options={"movflags": "+faststart"})
+        rate = Fraction(self._rate).limit_denominator(1001)
+        self._stream = self._container.add_stream("libx264", rate=rate, options=self._options)
+        self._stream.width, self._stream.height = width + width % 2, height + height % 2
+        self._stream.pix_fmt = "yuv420p"
+        context = self._stream.codec_context
+        context.time_base = Fraction(1, _CLOCK)
+        context.colorspace = context.color_primaries = context.color_trc = 6  # SMPTE 170M, which is BT.601
+        context.color_range = 1
+
+    def _mux(self, frame: Any) -> None:
+        for packet in self._stream.encode(frame):
+            self._container.mux(packet)

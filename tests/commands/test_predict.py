@@ -1,0 +1,253 @@
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.fakes import ColourBackend, coloured_scene
+from trilitenet.apps import cli
+from trilitenet.commands.predict import predict_with
+from trilitenet.errors import BackendError, ConfigError, InputError, OutputError
+from trilitenet.inference.predictor import Predictor
+from trilitenet.inference.sources import Clip, VideoReader
+from trilitenet.inference.video import VideoWriter
+from trilitenet.models.trilitenet import build_network
+from trilitenet.models.weights import save_network
+from trilitenet.structures import Perception
+
+
+@pytest.fixture
+def predictor() -> Predictor:
+    return Predictor(ColourBackend(), batch_size=4)
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    network = build_network("tiny")
+    save_network(network, tmp_path / "random.safetensors", network.card)
+    return tmp_path / "random.safetensors"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with good pictures of every kind, and bad files."""
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    scene = coloured_scene()
+    Image.fromarray(scene).save(folder / "photo.jpg", quality=95)
+    Image.fromarray(scene[..., 1]).save(folder / "grey.png")
+    Image.fromarray(np.dstack([scene, np.full(scene.shape[:2], 200, np.uint8)])).save(folder / "alpha.png")
+    Image.fromarray(scene[..., 0].astype(np.uint16) * 257).save(folder / "deep.png")
+    exif = Image.Exif()
+    exif[0x0112] = 6  # to be turned clockwise to be upright
+    Image.fromarray(np.ascontiguousarray(np.rot90(scene))).save(folder / "turned.jpg", exif=exif, quality=95)
+    jpeg = io.BytesIO()
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (200, 200, 3), dtype=np.uint8)).save(jpeg, "JPEG")
+    (folder / "truncated.jpg").write_bytes(jpeg.getvalue()[:4000])
+    (folder / "text.txt").write_text("no picture")
+    (folder / "empty.jpg").write_bytes(b"")
+    (folder / ".hidden").write_bytes(b"x")
+    return folder
+
+
+def drive(path: Path, frames: int = 12, rate: float = 10) -> Path:
+    with VideoWriter(path, rate) as writer:
+        for i in range(frames):
+            scene = coloured_scene(180, 320)
+            scene[:20, : 10 * i + 2] = 255
+            writer.write(scene)
+    return path
+
+
+def test_a_folder_of_good_and_bad(folder: Path, tmp_path: Path, predictor: Predictor) -> None:
+    output = tmp_path / "out"
+    report = predict_with(predictor, [folder, tmp_path / "absent.jpg"], output)
+    assert report.images == 5
+    assert report.exit_code == 1
+    assert {Path(failure.source).name for failure in report.failures} == {
+        "truncated.jpg", "text.txt", "empty.jpg", "absent.jpg",
+    }  # fmt: skip
+    assert all(failure.source in failure.reason for failure in report.failures)
+    names = {"photo", "grey", "alpha", "deep", "turned"}
+    assert {path.name for path in output.iterdir()} == {f"{n}.{e}" for n in names for e in ("jpg", "json")}
+    for name in ("photo", "alpha", "turned"):
+        perception = Perception.from_dict(json.loads((output / f"{name}.json").read_text()))
+        assert perception.size == (360, 640), "the rotation must have been applied"
+        assert perception.boxes is not None
+        np.testing.assert_allclose(perception.boxes.xyxy, [[160, 90, 320, 180]], atol=4)
+        assert perception.drivable is not None
+        assert perception.drivable.mean() == pytest.approx(0.5, abs=0.02)
+        overlay = np.asarray(Image.open(output / f"{name}.jpg"))
+        assert overlay.shape == (360, 640, 3)
+        assert np.abs(overlay.astype(int) - coloured_scene()).mean() > 5
+
+
+def test_the_command_line(folder: Path, tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["predict", str(folder), "--output", str(tmp_path / "out"), "--model", str(weights), "--device", "cpu"]
+    assert cli.main(words) == 1
+    captured = capsys.readouterr()
+    assert "5 images" in captured.out
+    assert "3 failed" in captured.out
+    assert [line.partition(": ")[0] for line in captured.err.splitlines()] == ["error"] * 3
+    for name in ("truncated.jpg", "text.txt", "empty.jpg"):
+        assert f"{folder / name}: " in captured.err
+    assert cli.main(words) == 1
+    assert "--overwrite" in capsys.readouterr().err
+    assert cli.main([*words, "--overwrite", "--hide", "labels", "--hide", "lane"]) == 1
+    assert cli.main(["predict", "--output", "x"]) == 1
+    assert "no source was given" in capsys.readouterr().err
+
+
+def test_existing_results_are_refused_before_the_work_begins(
+    folder: Path, tmp_path: Path, predictor: Predictor
+) -> None:
+    output = tmp_path / "out"
+    output.mkdir()
+    for name in ("photo.jpg", "photo.json"):
+        (output / name).write_text("kept")
+        with pytest.raises(OutputError, match=f"{name}: exists already; choose another --output or add --overwrite"):
+            predict_with(predictor, [folder], output)
+        assert (output / name).read_text() == "kept"
+        assert len(list(output.iterdir())) == 1
+        (output / name).unlink()
+    assert predictor.backend.batches == []  # type: ignore[attr-defined]
+    (output / "other.jpg").write_text("kept")
+    assert predict_with(predictor, [folder / "photo.jpg"], output).exit_code == 0
+    assert predict_with(predictor, [folder / "photo.jpg"], output, overwrite=True).exit_code == 0
+    assert (output / "other.jpg").read_text() == "kept"
+
+
+def test_a_source_is_never_overwritten(folder: Path, predictor: Predictor) -> None:
+    before = (folder / "photo.jpg").read_bytes()
+    with pytest.raises(OutputError, match="beside their source"):
+        predict_with(predictor, [folder / "photo.jpg"], folder, overwrite=True)
+    assert (folder / "photo.jpg").read_bytes() == before
+
+
+def test_sources_of_one_name_are_told_apart(tmp_path: Path, predictor: Predictor) -> None:
+    for place in ("a", "b", "c"):
+        (tmp_path / place).mkdir()
+        Image.fromarray(coloured_scene(90, 160)).save(tmp_path / place / "x.png")
+    (tmp_path / "a" / "x.png").write_bytes(b"broken")
+    report = predict_with(predictor, [str(tmp_path / "*" / "x.png")], tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"x-2.jpg", "x-2.json", "x-3.jpg", "x-3.json"}
+    assert json.loads((tmp_path / "out" / "x-3.json").read_text())["source"].endswith("c/x.png")
+    assert len(report.failures) == 1
+
+
+def test_a_video(tmp_path: Path, predictor: Predictor) -> None:
+    source, output = drive(tmp_path / "drive.mp4"), tmp_path / "out"
+    report = predict_with(predictor, [source], output, format=("json", "jsonl"))
+    assert (report.videos, report.frames, report.exit_code) == (1, 12, 0)
+    assert {path.name for path in output.iterdir()} == {"drive.mp4", "drive.json", "perceptions.jsonl"}
+    frames = json.loads((output / "drive.json").read_text())["frames"]
+    assert [frame["frame"] for frame in frames] == list(range(12))
+    assert [frame["timestamp"] for frame in frames] == pytest.approx([i / 10 for i in range(12)], abs=1e-3)
+    overlay = list(VideoReader(output / "drive.mp4"))
+    assert [frame.timestamp for frame in overlay] == pytest.approx([i / 10 for i in range(12)], abs=1e-3)
+    tinted = overlay[3].image[150, 20].astype(int)
+    np.testing.assert_allclose(tinted, np.array([20, 200, 20]) * 0.58 + np.array([0, 158, 115]) * 0.42, atol=12)
+
+
+def test_parts_of_a_video(tmp_path: Path, predictor: Predictor) -> None:
+    source = drive(tmp_path / "drive.mp4")
+    clip = Clip(every=2, start=0.3, end=1.0, max_frames=3)
+    report = predict_with(predictor, [source], tmp_path / "out", clip=clip, format=("jsonl",), overlay=False)
+    lines = (tmp_path / "out" / "perceptions.jsonl").read_text().splitlines()
+    assert [json.loads(line)["frame"] for line in lines] == [3, 5, 7]
+    assert report.frames == 3
+    assert report.files == ()
+
+
+def test_a_broken_video_among_good_sources(tmp_path: Path, predictor: Predictor) -> None:
+    good, broken, empty = drive(tmp_path / "good.mp4"), tmp_path / "broken.mp4", tmp_path / "empty.mp4"
+    broken.write_bytes(good.read_bytes()[:500])
+    empty.write_bytes(b"")
+    report = predict_with(predictor, [broken, good, empty], tmp_path / "out")
+    assert report.videos == 1
+    assert report.frames == 12
+    assert {Path(failure.source).name for failure in report.failures} == {"broken.mp4", "empty.mp4"}
+
+
+def test_an_interruption_leaves_a_playable_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    predictor = Predictor(ColourBackend(), batch_size=1)
+    written = 0
+    write = VideoWriter.write
+
+    def interrupted(self: VideoWriter, image: np.ndarray, timestamp: float | None = None) -> None:
+        nonlocal written
+        if written == 5:
+            raise KeyboardInterrupt
+        written += 1
+        write(self, image, timestamp)
+
+    source = drive(tmp_path / "drive.mp4", frames=40)
+    monkeypatch.setattr(VideoWriter, "write", interrupted)
+    report = predict_with(predictor, [source, source], tmp_path / "out")
+    assert report.interrupted
+    assert report.exit_code == 130
+    assert report.summary().startswith("interrupted: 1 video of 5 frames")
+    assert len(list(VideoReader(tmp_path / "out" / "drive.mp4"))) == 5
+    assert len(json.loads((tmp_path / "out" / "drive.json").read_text())["frames"]) == 5
+
+
+def test_a_failing_backend_is_an_error_and_no_thread_hangs(tmp_path: Path) -> None:
+    predictor = Predictor(ColourBackend(fail_after=2), batch_size=2)
+    with pytest.raises(BackendError, match="as it was told to"):
+        predict_with(predictor, [drive(tmp_path / "drive.mp4")], tmp_path / "out")
+
+
+def test_a_full_disk_is_named_and_leaves_no_half_file(tmp_path: Path) -> None:
+    """Stand in for a full disk by a limit on the size of files, in a process of its own."""
+    with VideoWriter(tmp_path / "drive.mp4") as writer:
+        for i in range(12):
+            writer.write(np.random.default_rng(i).integers(0, 256, (180, 320, 3), dtype=np.uint8))
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (900, 900, 3), dtype=np.uint8)).save(tmp_path / "a.png")
+    script = f"""
+import resource, sys
+from pathlib import Path
+from tests.fakes import ColourBackend
+from trilitenet.commands.predict import predict_with
+from trilitenet.errors import OutputError
+from trilitenet.inference.predictor import Predictor
+resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
+for source in ("drive.mp4", "a.png"):
+    try:
+        predict_with(Predictor(ColourBackend()), [Path({str(tmp_path)!r}) / source], Path({str(tmp_path)!r}) / "out",
+                     format=())
+    except OutputError as error:
+        assert "cannot be written (File too large)" in str(error), error
+    else:
+        sys.exit(f"{{source}}: nothing was raised")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=120, cwd=Path(__file__).parents[2]
+    )
+    assert done.returncode == 0, done.stderr
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_mistakes_are_named_before_anything_is_written(tmp_path: Path, predictor: Predictor, folder: Path) -> None:
+    output = tmp_path / "out"
+    with pytest.raises(ConfigError, match="did you mean 'labels'"):
+        predict_with(predictor, [folder], output, hide=("label",))
+    with pytest.raises(ConfigError, match="did you mean 'coco'"):
+        predict_with(predictor, [folder], output, format=("cocoo",))
+    with pytest.raises(InputError, match="no source"):
+        predict_with(predictor, [], output)
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(OutputError, match="is a file"):
+        predict_with(predictor, [folder], tmp_path / "file")
+
+
+@pytest.mark.parametrize("format", ["scalabel", "openlabel", "coco", "yolo", "cvat", "csv"])
+def test_other_formats(format: str, folder: Path, tmp_path: Path, predictor: Predictor) -> None:
+    report = predict_with(predictor, [folder / "photo.jpg"], tmp_path / "out", format=(format,), overlay=False)
+    assert report.exit_code == 0
+    assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()]

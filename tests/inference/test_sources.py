@@ -1,0 +1,381 @@
+from __future__ import annotations
+
+import functools
+import http.server
+import io
+import logging
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from trilitenet.errors import ConfigError, InputError
+from trilitenet.inference.sources import (
+    CameraReader,
+    Clip,
+    Failure,
+    Frame,
+    FrameReader,
+    SequenceReader,
+    Stills,
+    StreamReader,
+    VideoReader,
+    find_sources,
+)
+from trilitenet.inference.video import VideoWriter
+
+av = pytest.importorskip("av")
+
+
+def shade(index: int, height: int = 96, width: int = 160) -> np.ndarray:
+    """Return an image whose brightness tells its index, with its upper left corner white."""
+    image = np.full((height, width, 3), 20 + 10 * index, np.uint8)
+    image[: height // 4, : width // 4] = 255
+    return image
+
+
+def index_of(frame: Frame) -> int:
+    return round((float(frame.image[-10:, -10:].mean()) - 20) / 10)
+
+
+def video(path: Path, frames: int = 20, rate: float = 10, times: list[float] | None = None) -> Path:
+    with VideoWriter(path, rate, quality=10) as writer:
+        for i in range(frames):
+            writer.write(shade(i), None if times is None else times[i])
+    return path
+
+
+def transport_stream(first: int, frames: int) -> bytes:
+    """Return an MPEG-TS stream, which can be cut anywhere, at 10 frames a second."""
+    buffer = io.BytesIO()
+    with av.open(buffer, "w", format="mpegts") as container:
+        stream = container.add_stream("mpeg2video", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 160, 96, "yuv420p"
+        stream.codec_context.gop_size = 1
+        stream.bit_rate = 2_000_000
+        for i in range(first, first + frames):
+            frame = av.VideoFrame.from_ndarray(shade(i), "rgb24")
+            frame.pts, frame.time_base = i - first, Fraction(1, 10)
+            for packet in stream.encode(frame):
+                container.mux(packet)
+        for packet in stream.encode(None):
+            container.mux(packet)
+    return buffer.getvalue()
+
+
+def test_a_video_gives_every_frame_in_order_with_its_time(tmp_path: Path) -> None:
+    reader = VideoReader(video(tmp_path / "a.mp4"))
+    frames = list(reader)
+    assert [index_of(frame) for frame in frames] == [frame.index for frame in frames] == list(range(20))
+    assert [frame.timestamp for frame in frames] == pytest.approx([i / 10 for i in range(20)])
+    assert (reader.rate, reader.expected, reader.broken) == (10, 20, 0)
+    assert frames[0].source == str(tmp_path / "a.mp4")
+
+
+def test_colours_survive_the_way_there_and_back(tmp_path: Path) -> None:
+    scene = np.zeros((96, 160, 3), np.uint8)
+    colours = np.array([(200, 30, 30), (30, 160, 30), (30, 30, 200), (120, 120, 120)])
+    for i, colour in enumerate(colours):
+        scene[:, 40 * i : 40 * i + 40] = colour
+    with VideoWriter(tmp_path / "colours.mp4", 10, quality=10) as writer:
+        writer.write(scene)
+    (frame,) = VideoReader(tmp_path / "colours.mp4")
+    np.testing.assert_allclose(frame.image[48, [20, 60, 100, 140]].astype(int), colours, atol=6)
+
+
+@pytest.mark.parametrize(
+    ("clip", "expected"),
+    [
+        (Clip(every=6), [0, 6, 12, 18]),
+        (Clip(start=1.5), [15, 16, 17, 18, 19]),
+        (Clip(end=0.3), [0, 1, 2]),
+        (Clip(start=0.55, end=1.2, every=3), [6, 9]),
+        (Clip(max_frames=2), [0, 1]),
+        (Clip(start=1.0, max_frames=2, every=4), [10, 14]),
+    ],
+)
+def test_parts_of_a_video(tmp_path: Path, clip: Clip, expected: list[int]) -> None:
+    reader = VideoReader(video(tmp_path / "a.mp4"), clip)
+    frames = list(reader)
+    assert [index_of(frame) for frame in frames] == [frame.index for frame in frames] == expected
+    assert [frame.timestamp for frame in frames] == pytest.approx([i / 10 for i in expected])
+    assert reader.expected is not None
+    assert abs(reader.expected - len(expected)) <= 1
+
+
+def test_a_variable_frame_rate_is_kept(tmp_path: Path) -> None:
+    times = [0, 0.1, 0.15, 0.5, 0.9, 2.0]
+    frames = list(VideoReader(video(tmp_path / "a.mp4", frames=6, times=times)))
+    assert [frame.timestamp for frame in frames] == pytest.approx(times, abs=1e-3)
+    assert [index_of(frame) for frame in frames] == list(range(6))
+
+
+@pytest.mark.parametrize(("matrix", "turns"), [((0, 1, -1, 0), -1), ((-1, 0, 0, -1), 2), ((0, -1, 1, 0), 1)])
+def test_rotation_noted_in_the_file_is_applied(tmp_path: Path, matrix: tuple[int, ...], turns: int) -> None:
+    path = video(tmp_path / "a.mp4", frames=2)
+    data = bytearray(path.read_bytes())
+    place = data.index(b"tkhd") + 4 + 40  # the transformation matrix of the track header, 16.16 fixed point
+    a, b, c, d = (value << 16 for value in matrix)
+    for offset, value in ((0, a), (4, b), (12, c), (16, d)):
+        data[place + offset : place + offset + 4] = value.to_bytes(4, "big", signed=True)
+    path.write_bytes(data)
+    upright = np.rot90(shade(0), turns)
+    frame = next(iter(VideoReader(path)))
+    assert frame.image.shape == upright.shape
+    np.testing.assert_allclose(frame.image.astype(int), upright, atol=12)
+
+
+def test_broken_frames_are_left_out_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    data = bytearray(transport_stream(0, 20))
+    rng = np.random.default_rng(0)
+    for start in range(len(data) // 3, len(data) // 3 + 3000, 188):
+        data[start : start + 100] = rng.integers(0, 256, 100, dtype=np.uint8).tobytes()
+    (tmp_path / "a.ts").write_bytes(data)
+    reader = VideoReader(tmp_path / "a.ts")
+    with caplog.at_level(logging.WARNING):
+        frames = list(reader)
+    assert 10 <= len(frames) < 20
+    times = [frame.timestamp or 0.0 for frame in frames]
+    assert times == sorted(times)
+
+
+def test_a_video_cut_short_gives_what_there_is(tmp_path: Path) -> None:
+    data = transport_stream(0, 20)
+    (tmp_path / "a.ts").write_bytes(data[: len(data) // 2])
+    assert 6 <= len(list(VideoReader(tmp_path / "a.ts"))) <= 12
+
+
+def test_what_is_no_video_is_named(tmp_path: Path) -> None:
+    good = video(tmp_path / "good.mp4").read_bytes()
+    for name, data in {"text.mp4": b"not a video" * 100, "empty.mp4": b"", "cut.mp4": good[:600]}.items():
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(InputError, match=name):
+            VideoReader(tmp_path / name)
+    with av.open(str(tmp_path / "sound.mp4"), "w") as container:
+        stream = container.add_stream("aac", rate=44100)
+        silence = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        silence.sample_rate = 44100
+        for frame in (silence, None):
+            for packet in stream.encode(frame):
+                container.mux(packet)
+    with pytest.raises(InputError, match=r"sound\.mp4: has no video stream"):
+        VideoReader(tmp_path / "sound.mp4")
+
+
+def test_no_frames_is_an_error(tmp_path: Path) -> None:
+    reader = VideoReader(video(tmp_path / "a.mp4"), Clip(start=100))
+    with pytest.raises(InputError, match="has no frames that can be decoded between --start and --end"):
+        list(reader)
+
+    class Empty(FrameReader):
+        def _decode(self) -> Iterator[tuple[float, Callable[[], np.ndarray]]]:
+            yield from ()
+
+    with pytest.raises(InputError, match=r"empty: has no frames that can be decoded$"):
+        list(Empty("empty"))
+
+
+def test_standard_input() -> None:
+    script = (
+        "from trilitenet.inference.sources import VideoReader\n"
+        "print([(f.index, f.source, f.image.shape) for f in VideoReader('-')])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], input=transport_stream(0, 3), capture_output=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr.decode()
+    assert done.stdout.decode().strip() == str([(i, "stdin", (96, 160, 3)) for i in range(3)])
+
+
+class Server:
+    """An HTTP server on this machine that sends one part a connection and hangs up; then refuses."""
+
+    def __init__(self, parts: list[bytes], *, length: bool = False) -> None:
+        self.connections = 0
+        outer = self
+
+        class Handler(http.server.BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                if outer.connections >= len(parts):
+                    self.send_error(404)
+                    return
+                part = parts[outer.connections]
+                outer.connections += 1
+                self.send_response(200)
+                self.send_header("Content-Type", "video/mp2t")
+                if length:
+                    self.send_header("Content-Length", str(len(part)))
+                self.end_headers()
+                self.wfile.write(part)
+
+            def log_message(self, *args: Any) -> None:
+                pass
+
+        self.server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+        self.url = f"http://user:secret@127.0.0.1:{self.server.server_port}/live.ts?token=x"
+
+    def __enter__(self) -> Server:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.server.shutdown()
+        self.server.server_close()
+
+
+def test_a_stream_that_dies_twice_is_picked_up(caplog: pytest.LogCaptureFixture) -> None:
+    with Server([transport_stream(0, 5), transport_stream(5, 5), transport_stream(10, 5)]) as server:
+        reader = StreamReader(server.url, retries=2, backoff=0.01)
+        with caplog.at_level(logging.WARNING):
+            frames = list(reader)
+    seen = [index_of(frame) for frame in frames]
+    assert seen == sorted(seen)
+    assert {0, 5, 6, 10, 11} <= set(seen)
+    assert [frame.index for frame in frames] == list(range(len(frames)))
+    times = [frame.timestamp or 0.0 for frame in frames]
+    assert times[0] == pytest.approx(0, abs=1e-3)
+    assert reader.reconnections == 2
+    assert "trying again" in caplog.text
+    assert "given up after 2 attempts" in caplog.text
+    assert "secret" not in caplog.text
+    assert "token" not in frames[0].source
+
+
+def test_a_stream_that_never_comes_is_an_error_at_once() -> None:
+    with Server([]) as server, pytest.raises(InputError, match=r"http://127\.0\.0\.1:\d+/live\.ts: is not a video"):
+        list(StreamReader(server.url, backoff=60))
+
+
+def test_closing_ends_the_wait_for_a_stream() -> None:
+    with Server([transport_stream(0, 3)]) as server:
+        reader = StreamReader(server.url, backoff=60)
+        threading.Timer(0.5, reader.close).start()
+        assert len(list(reader)) >= 1
+
+
+def test_the_wait_grows_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Server([transport_stream(0, 3)]) as server:
+        reader = StreamReader(server.url, backoff=1, longest=5, retries=5)
+        waits: list[float] = []
+
+        def wait(seconds: float) -> bool:
+            waits.append(seconds)
+            return False
+
+        monkeypatch.setattr(reader._closed, "wait", wait)
+        list(reader)
+    assert waits == [1, 2, 4, 5, 5]
+
+
+def test_a_url_of_a_file_is_read_to_its_end(tmp_path: Path) -> None:
+    video(tmp_path / "a.mp4", frames=5)
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(tmp_path))
+    monkey: Any = http.server.SimpleHTTPRequestHandler
+    quiet = type("Quiet", (monkey,), {"log_message": lambda *_: None})
+    handler = functools.partial(quiet, directory=str(tmp_path))
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        (source,), failures = find_sources([f"http://127.0.0.1:{server.server_port}/a.mp4"])
+        assert not failures
+        assert isinstance(source, VideoReader)
+        assert len(list(source)) == 5
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def test_numbered_pictures_are_a_video(tmp_path: Path) -> None:
+    for i in (3, 4, 5, 7):
+        Image.fromarray(shade(i)).save(tmp_path / f"img_{i:04d}.png")
+    (tmp_path / "img_0005.png").write_bytes(b"broken")
+    (tmp_path / "img_0005x.png").write_bytes(b"another")
+    reader = SequenceReader(str(tmp_path / "img_%04d.png"), rate=10)
+    frames = list(reader)
+    assert [index_of(frame) for frame in frames] == [3, 4, 7]
+    assert [frame.timestamp for frame in frames] == [0, 0.1, pytest.approx(0.3)]
+    assert reader.broken == 1
+    assert reader.name == str(tmp_path / "img")
+    with pytest.raises(InputError, match="no file matches"):
+        SequenceReader(str(tmp_path / "other_%04d.png"))
+    with pytest.raises(ConfigError, match="must be positive"):
+        SequenceReader(str(tmp_path / "img_%04d.png"), rate=0)
+
+
+def test_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Camera:
+        def __init__(self, number: int) -> None:
+            self.left = 3 if number == 0 else 0
+            self.opened = number == 0
+
+        def isOpened(self) -> bool:  # noqa: N802 - as OpenCV calls it
+            return self.opened
+
+        def get(self, _: int) -> float:
+            return 25.0
+
+        def read(self) -> tuple[bool, np.ndarray | None]:
+            self.left -= 1
+            blue_in_bgr = np.zeros((8, 8, 3), np.uint8)
+            blue_in_bgr[..., 0] = 255
+            return self.left >= 0, blue_in_bgr
+
+        def release(self) -> None:
+            pass
+
+    monkeypatch.setattr("cv2.VideoCapture", Camera)
+    frames = list(CameraReader(0))
+    assert len(frames) == 3
+    assert frames[0].source == "camera-0"
+    np.testing.assert_array_equal(frames[0].image[0, 0], [0, 0, 255])
+    with pytest.raises(InputError, match="camera-7: there is no such camera"):
+        list(CameraReader(7))
+
+
+def test_stills_go_on_past_a_broken_one(tmp_path: Path) -> None:
+    Image.fromarray(shade(1)).save(tmp_path / "a.png")
+    (tmp_path / "b.png").write_bytes(b"broken")
+    first, second = Stills((tmp_path / "a.png", tmp_path / "b.png"))
+    assert isinstance(first, Frame)
+    assert first.index is first.timestamp is None
+    assert isinstance(second, Failure)
+    assert second.source == str(tmp_path / "b.png")
+
+
+def test_what_a_user_names(tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+    (folder / "below").mkdir(parents=True)
+    for name in ("10.png", "9.png", ".hidden.png", "below/1.png"):
+        Image.fromarray(shade(0)).save(folder / name)
+    video(folder / "7.mp4", frames=1)
+    found, failures = find_sources([folder])
+    assert [type(source) for source in found] == [VideoReader, Stills]
+    assert isinstance(found[1], Stills)
+    assert [path.name for path in found[1].paths] == ["9.png", "10.png"]
+    assert failures == []
+
+    found, failures = find_sources([str(folder / "**" / "*.png"), "0", tmp_path / "no.png", tmp_path / "no*.png"])
+    assert [type(source) for source in found] == [Stills, CameraReader]
+    assert isinstance(found[0], Stills)
+    assert [path.name for path in found[0].paths] == ["9.png", "10.png", "1.png"]
+    assert [failure.reason for failure in failures] == [
+        f"{tmp_path / 'no.png'}: no such file or folder",
+        f"{tmp_path / 'no*.png'}: no file matches",
+    ]
+    found, _ = find_sources(["rtsp://camera.local/stream"])
+    assert [type(source) for source in found] == [StreamReader]
+    (tmp_path / "nothing").mkdir()
+    assert find_sources([tmp_path / "nothing"])[1][0].reason.endswith("is an empty folder")
+
+
+@pytest.mark.parametrize("wrong", [{"every": 0}, {"max_frames": 0}, {"start": -1}, {"start": 3, "end": 2}])
+def test_impossible_clips_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ConfigError):
+        Clip(**wrong)  # type: ignore[arg-type]

@@ -1,0 +1,242 @@
+from __future__ import annotations
+
+import gc
+import os
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.fakes import ColourBackend, coloured_scene
+from trilitenet.errors import BackendError, OutputError
+from trilitenet.inference.predictor import Predictor
+from trilitenet.inference.sources import Frame, FrameReader, Stills, VideoReader
+from trilitenet.inference.video import PerceptionStream, Prefetch, VideoWriter
+from trilitenet.structures import Perception, RawOutputs
+
+av = pytest.importorskip("av")
+
+
+class Scenes(FrameReader):
+    """Generated frames; it keeps count of how far it was read."""
+
+    def __init__(self, count: int, size: tuple[int, int] = (96, 160), *, live: bool = False, pause: float = 0) -> None:
+        super().__init__("scenes")
+        self.count, self.size, self.pause, self.given = count, size, pause, 0
+        self.live = live
+
+    def _decode(self) -> Iterator[tuple[float, object]]:
+        for i in range(self.count):
+            self.given += 1
+            time.sleep(self.pause)
+            yield i / 30, lambda: coloured_scene(*self.size)
+
+
+def test_prefetch_gives_all_in_order_and_the_error_at_its_place() -> None:
+    def items() -> Iterator[int]:
+        yield from range(5)
+        raise ValueError("at the end")
+
+    ahead = Prefetch(items(), 2)
+    assert [next(ahead) for _ in range(5)] == list(range(5))
+    with pytest.raises(ValueError, match="at the end"):
+        next(ahead)
+    assert list(ahead) == []
+
+
+def test_prefetch_runs_only_so_far_ahead() -> None:
+    taken = 0
+
+    def items() -> Iterator[int]:
+        nonlocal taken
+        for i in range(100):
+            taken += 1
+            yield i
+
+    ahead = Prefetch(items(), 3)
+    time.sleep(0.2)
+    assert taken <= 4
+    next(ahead)
+    time.sleep(0.2)
+    assert taken <= 5
+    ahead.close()
+    assert list(ahead) == []
+
+
+def test_prefetch_closes_the_generator_and_ends_its_thread() -> None:
+    closed = threading.Event()
+
+    def items() -> Iterator[int]:
+        try:
+            while True:
+                yield 1
+        finally:
+            closed.set()
+
+    before = threading.active_count()
+    Prefetch(items(), 1).close()
+    assert closed.is_set()
+    assert threading.active_count() == before
+
+
+def test_prefetch_forgets_the_oldest_of_a_live_source() -> None:
+    ahead = Prefetch(range(50), 2, drop_oldest=True)
+    time.sleep(0.3)
+    assert list(ahead) == [48, 49]
+    assert ahead.dropped == 48
+
+
+def test_frames_of_a_file_are_batched_and_stay_in_order() -> None:
+    backend = ColourBackend()
+    with PerceptionStream(Scenes(10), Predictor(backend, batch_size=4)) as stream:
+        perceptions = [item for item in stream if isinstance(item, Perception)]
+    assert [shape[0] for shape in backend.batches] == [4, 4, 2]
+    assert [perception.frame for perception in perceptions] == list(range(10))
+    assert [perception.timestamp for perception in perceptions] == pytest.approx([i / 30 for i in range(10)])
+    assert all(perception.source == "scenes" for perception in perceptions)
+
+
+def test_a_live_source_goes_one_by_one_and_never_piles_up() -> None:
+    backend = ColourBackend()
+    source = Scenes(60, live=True, pause=0.002)
+    with PerceptionStream(source, Predictor(backend, batch_size=4)) as stream:
+        frames = []
+        for item in stream:
+            assert isinstance(item, Perception)
+            frames.append(item.frame or 0)
+            time.sleep(0.02)
+    assert all(shape[0] == 1 for shape in backend.batches)
+    assert frames == sorted(frames)
+    assert stream.dropped > 10
+    assert len(frames) + stream.dropped <= 60
+
+
+def test_leaving_early_ends_the_threads() -> None:
+    before = threading.active_count()
+    source = Scenes(100_000)
+    with PerceptionStream(source, Predictor(ColourBackend(), batch_size=2)) as stream:
+        next(iter(stream))
+    assert source.given < 60
+    assert threading.active_count() == before
+
+
+def test_an_error_of_the_backend_arrives() -> None:
+    predictor = Predictor(ColourBackend(fail_after=1), batch_size=1)
+    with PerceptionStream(Scenes(10), predictor) as stream, pytest.raises(BackendError):
+        list(stream)
+
+
+def test_failures_keep_their_place(tmp_path: Path) -> None:
+    paths = []
+    for i in range(5):
+        paths.append(tmp_path / f"{i}.ppm")
+        paths[-1].write_bytes(b"P6 64 64 255\n" + bytes(64 * 64 * 3 if i != 2 else 7))
+    with PerceptionStream(Stills(tuple(paths)), Predictor(ColourBackend(), batch_size=4)) as stream:
+        sources = [item.source for item in stream]
+    assert sources == [str(path) for path in paths]
+
+
+def test_stages_overlap() -> None:
+    """Reading, inference and drawing that take 10 ms each: together well under their sum."""
+
+    class Slow(ColourBackend):
+        def run(self, batch: np.ndarray) -> RawOutputs:
+            time.sleep(0.01 * len(batch))
+            return super().run(batch)
+
+    began = time.perf_counter()
+    with PerceptionStream(Scenes(60, (32, 32), pause=0.01), Predictor(Slow(), long_side=32, batch_size=1)) as stream:
+        for _ in stream:
+            time.sleep(0.01)
+    assert time.perf_counter() - began < 0.75 * 60 * 0.03
+
+
+@pytest.mark.parametrize("size", [(96, 160), (97, 161), (1, 1)])
+def test_a_browser_plays_it(tmp_path: Path, size: tuple[int, int]) -> None:
+    with VideoWriter(tmp_path / "a.mp4", 25) as writer:
+        for _ in range(5):
+            writer.write(coloured_scene(*size))
+    data = (tmp_path / "a.mp4").read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat"), "the index must be at the front"
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        stream = container.streams.video[0]
+        assert stream.codec_context.name == "h264"
+        assert stream.pix_fmt == "yuv420p"
+        assert (stream.height, stream.width) == tuple(side + side % 2 for side in size)
+        assert len(list(container.decode(stream))) == 5
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
+
+
+def test_time_stamps_that_stand_still_or_go_back_are_mended(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "a.mp4") as writer:
+        for timestamp in (0.0, 0.0, 0.2, 0.1, 0.3):
+            writer.write(coloured_scene(32, 32), timestamp)
+    times = [frame.timestamp or 0.0 for frame in VideoReader(tmp_path / "a.mp4")]
+    assert len(times) == 5
+    assert times == sorted(set(times))
+
+
+def test_a_change_of_size_is_brought_to_the_first(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "a.mp4") as writer:
+        writer.write(coloured_scene(64, 96))
+        writer.write(coloured_scene(96, 64))
+    assert [frame.image.shape for frame in VideoReader(tmp_path / "a.mp4")] == [(64, 96, 3)] * 2
+
+
+def test_without_frames_there_is_no_file(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "a.mp4"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unfinished_video_has_no_final_name(tmp_path: Path) -> None:
+    writer = VideoWriter(tmp_path / "a.mp4")
+    for _ in range(3):
+        writer.write(coloured_scene(32, 32))
+    assert not (tmp_path / "a.mp4").exists()
+    writer.abort()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    writer = VideoWriter(tmp_path / "file" / "a.mp4")
+    for _ in range(20):  # more than wait in the queue: writing must not hang
+        try:
+            writer.write(coloured_scene(32, 32))
+        except OutputError:
+            break
+    with pytest.raises(OutputError, match=r"a\.mp4: the video cannot be written"):
+        writer.close()
+
+
+def resident() -> float:
+    """Return the process's resident memory in MB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux's /proc")
+def test_memory_is_flat_over_10000_frames(tmp_path: Path) -> None:
+    marks = []
+    predictor = Predictor(ColourBackend(), long_side=64, batch_size=4)
+    stream = PerceptionStream(Scenes(10_000, (72, 128)), predictor)
+    with stream, VideoWriter(tmp_path / "a.mp4", preset="ultrafast") as writer:
+        for i, item in enumerate(stream):
+            assert isinstance(item, Perception)
+            writer.write(item.draw(), item.timestamp)
+            if i % 1000 == 999:
+                gc.collect()
+                marks.append(resident())
+    assert len(marks) == 10
+    assert marks[-1] - marks[2] < 12, f"resident memory grew: {marks}"
+
+
+def test_frame_is_what_it_says() -> None:
+    frame = next(iter(Scenes(1)))
+    assert isinstance(frame, Frame)
+    assert (frame.index, frame.timestamp, frame.source) == (0, 0.0, "scenes")
