@@ -264,9 +264,7 @@ def _explain(cls: type[Any], error: ValidationError) -> str:
     if first["type"] in {"unexpected_keyword_argument", "extra_forbidden"}:
         owner: Any = cls
         for part in first["loc"][:-1]:
-            owner = next(
-                (f.default for f in dataclasses.fields(owner) if f.name == part), owner
-            )
+            owner = next((f.default for f in dataclasses.fields(owner) if f.name == part), owner)
         names = [field.name for field in dataclasses.fields(owner)]
         return f"unknown key {path!r}{did_you_mean(str(first['loc'][-1]), names)}"
     if first["type"] in {"missing", "missing_argument"}:

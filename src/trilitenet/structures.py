@@ -122,9 +122,7 @@ class Perception:
         if self.image is not None and self.image.shape != (*self.size, 3):
             raise ShapeError(f"image must be {(*self.size, 3)}, got {self.image.shape}")
         if self.boxes is not None and len(self.boxes) and self.boxes.class_id.max() >= len(self.class_names):
-            raise ShapeError(
-                f"class id {int(self.boxes.class_id.max())} has no name among {self.class_names}"
-            )
+            raise ShapeError(f"class id {int(self.boxes.class_id.max())} has no name among {self.class_names}")
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``json.dumps`` takes: the documented, versioned JSON form (masks as COCO run-length)."""

@@ -22,14 +22,14 @@ def _values(key: str, shape: list[int], dtype: str) -> NDArray[Any]:
     if dtype == "int64":
         return np.array(100, dtype=np.int64)
     if key.endswith("running_var"):
-        return random.uniform(0.6, 1.4, shape).astype(np.float32)
+        return np.asarray(random.uniform(0.6, 1.4, shape), np.float32)
     if key.endswith("running_mean"):
-        return random.normal(0, 0.1, shape).astype(np.float32)
+        return np.asarray(random.normal(0, 0.1, shape), np.float32)
     if len(shape) == 1:
         one_dimensional = random.uniform(0.2, 1.0, shape) if key.endswith(".weight") else random.normal(0, 0.1, shape)
-        return one_dimensional.astype(np.float32)
+        return np.asarray(one_dimensional, np.float32)
     fan = int(np.prod(shape[1:])) or 1
-    return (random.normal(0, 1, shape) * np.sqrt(1.5 / fan)).astype(np.float32)
+    return np.asarray(random.normal(0, 1, shape) * np.sqrt(1.5 / fan), np.float32)
 
 
 @pytest.fixture(scope="session")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from trilitenet.config import VARIANTS
 from trilitenet.models.attention import merge_bins, split_bins
 from trilitenet.models.blocks import DepthwiseConv, DepthwiseESP, StrideESP
 from trilitenet.models.encoder import Encoder
-from trilitenet.config import VARIANTS
 
 
 def test_split_bins_inverts_and_keeps_bins_apart() -> None:
@@ -58,7 +58,7 @@ def test_pooled_images_count_the_zeros_of_the_padding() -> None:
 def test_dilated_depthwise_gradient_under_bf16_autocast(dilation: int) -> None:
     """PyTorch 2.13.0 on CPU gives a wrong weight gradient for bf16, channels-last and dilation; ours must not."""
     torch.manual_seed(0)
-    conv = DepthwiseConv(6, 3, dilation=dilation).to(memory_format=torch.channels_last)
+    conv = DepthwiseConv(6, 3, dilation=dilation).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     x = torch.randn(2, 6, 48, 80).to(memory_format=torch.channels_last)
     target = torch.randn(2, 6, 48, 80)
     conv(x).mul(target).sum().backward()

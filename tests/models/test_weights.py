@@ -20,7 +20,7 @@ from trilitenet.errors import ConfigError, OutputError, WeightsError
 from trilitenet.models.weights import CARD_KEY, import_published, read_card, rename_published, save_network
 
 
-@pytest.fixture()
+@pytest.fixture
 def saved(tmp_path: Path) -> Path:
     network = build_network("tiny")
     save_network(network, tmp_path / "net.safetensors", network.card)
@@ -36,7 +36,7 @@ def saved(tmp_path: Path) -> Path:
         (1, ("detection", "lane"), {"litepan": False}),
     ],
 )
-def test_round_trip(tmp_path: Path, classes: int, tasks: tuple[str, ...], blocks: dict[str, bool]) -> None:
+def test_round_trip(tmp_path: Path, classes: int, tasks: tuple[str, ...], blocks: dict[str, Any]) -> None:
     torch.manual_seed(1)
     network = build_network("tiny", classes, tasks, **blocks).eval()
     card = dataclasses.replace(network.card, thresholds=Thresholds(confidence=0.4, lane=0.7), licence="test")

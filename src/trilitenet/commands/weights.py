@@ -61,8 +61,11 @@ def info(file: str, /, *, json_output: bool = False) -> ModelCard:
             (f"anchors 1/{stride}", ", ".join(f"{width:g}x{height:g}" for width, height in level))
             for stride, level in zip((8, 16, 32), card.anchors, strict=True)
         ),
-        ("thresholds", f"box {thresholds.confidence:g} (NMS {thresholds.iou:g}), drivable {thresholds.drivable:g}, "
-         f"lane {thresholds.lane:g}"),
+        (
+            "thresholds",
+            f"box {thresholds.confidence:g} (NMS {thresholds.iou:g}), drivable {thresholds.drivable:g}, "
+            f"lane {thresholds.lane:g}",
+        ),
         *(("trained on", line) for line in card.training_data),
         *((name, f"{value:g}") for name, value in card.metrics.items()),
         *((name, value) for name, value in card.provenance.items()),

@@ -10,6 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from trilitenet.models.activation import PReLU, batch_norm_prelu
+
 __all__ = [
     "BatchNormPReLU",
     "ConvBNPReLU",
@@ -35,11 +37,11 @@ class BatchNormPReLU(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.bn = batch_norm(channels)
-        self.act = nn.PReLU(channels)
+        self.act = PReLU(channels)
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the block."""
-        out: Tensor = self.act(self.bn(x))
+        out: Tensor = batch_norm_prelu(self.bn, self.act, x)
         return out
 
 
@@ -50,11 +52,11 @@ class ConvBNPReLU(nn.Module):
         super().__init__()
         self.conv = nn.Conv2d(in_channels, out_channels, kernel, stride, padding=kernel // 2, bias=False)
         self.bn = batch_norm(out_channels)
-        self.act = nn.PReLU(out_channels)
+        self.act = PReLU(out_channels)
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the block."""
-        out: Tensor = self.act(self.bn(self.conv(x)))
+        out: Tensor = batch_norm_prelu(self.bn, self.act, self.conv(x))
         return out
 
 
@@ -65,11 +67,11 @@ class TransposedConvBNPReLU(nn.Module):
         super().__init__()
         self.deconv = nn.ConvTranspose2d(in_channels, out_channels, 2, 2, bias=False)
         self.bn = batch_norm(out_channels)
-        self.act = nn.PReLU(out_channels)
+        self.act = PReLU(out_channels)
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the block."""
-        out: Tensor = self.act(self.bn(self.deconv(x)))
+        out: Tensor = batch_norm_prelu(self.bn, self.act, self.deconv(x))
         return out
 
 
@@ -144,13 +146,13 @@ class StrideESP(nn.Module):
             nn.Conv2d(branch, branch, 3, padding=d, dilation=d, bias=False) for d in DILATIONS
         )
         self.bn = batch_norm(out_channels)
-        self.act = nn.PReLU(out_channels)
+        self.act = PReLU(out_channels)
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the block."""
         x = self.reduce(x)
         fused = _fuse_hierarchically(self.d1(x), self.d2(x), self.d4(x), self.d8(x), self.d16(x))
-        out: Tensor = self.act(self.bn(fused))
+        out: Tensor = batch_norm_prelu(self.bn, self.act, fused)
         return out
 
 
@@ -165,9 +167,7 @@ class DepthwiseESP(nn.Module):
         branch, first = _split(channels)
         self.reduce = DepthwiseSeparableConv(channels, branch, 1)
         self.d1 = DepthwiseSeparableConv(branch, first, 3)
-        self.d2, self.d4, self.d8, self.d16 = (
-            DepthwiseSeparableConv(branch, branch, 3, dilation=d) for d in DILATIONS
-        )
+        self.d2, self.d4, self.d8, self.d16 = (DepthwiseSeparableConv(branch, branch, 3, dilation=d) for d in DILATIONS)
         self.bn_act = BatchNormPReLU(channels)
 
     def forward(self, x: Tensor) -> Tensor:

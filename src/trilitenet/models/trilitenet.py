@@ -80,9 +80,7 @@ class TriLiteNet(nn.Module):
         self.tasks = tasks
         detects = "detection" in tasks
         segments = "drivable" in tasks or "lane" in tasks
-        self.blocks = tuple(
-            name for name in blocks if (segments if name == "pcaa" else detects)
-        )
+        self.blocks = tuple(name for name in blocks if (segments if name == "pcaa" else detects))
 
         self.encoder = Encoder(config, deep=detects)
         self.spp = SPP(c4) if detects and "spp" in blocks else None

@@ -95,7 +95,8 @@ def resolve_weights(model: str | os.PathLike[str]) -> Path:
     if path.is_file():
         return path
     if isinstance(model, str) and model in VARIANTS:
-        raise WeightsError(f"no weights are shipped for {model!r} (shipped: {', '.join(shipped) or 'none'}); give a file")
+        known = ", ".join(shipped) or "none"
+        raise WeightsError(f"no weights are shipped for {model!r} (shipped: {known}); give a file")
     what = "is a folder" if path.is_dir() else "does not exist"
     raise WeightsError(f"{path}: {what}; give a .safetensors file or one of: {', '.join(shipped) or 'none shipped'}")
 
@@ -265,9 +266,7 @@ def _is_pickle(path: Path) -> bool:
         return file.read(2) in {b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"}
 
 
-def _load_strictly(
-    network: TriLiteNet, tensors: Mapping[str, Tensor], source: str, *, published: bool = False
-) -> None:
+def _load_strictly(network: TriLiteNet, tensors: Mapping[str, Tensor], source: str, *, published: bool = False) -> None:
     own = network.state_dict()
     optional = {key for key in own if key == "anchors" or key.endswith("num_batches_tracked")}
     missing = [key for key in own if key not in tensors and key not in optional]
@@ -304,7 +303,8 @@ def _read_pickle(path: Path) -> dict[str, Tensor]:
         found = re.search(r"(?:GLOBAL|global) (\S+)", text)
         if found or "Unsupported" in text:
             name = f" ({found.group(1)})" if found else ""
-            raise WeightsError(f"{path}: holds code or objects beside tensors{name}; it was not run, nor read") from error
+            message = f"{path}: holds code or objects beside tensors{name}; it was not run, nor read"
+            raise WeightsError(message) from error
         raise WeightsError(f"{path}: is not a PyTorch checkpoint, or is truncated") from error
     except (RuntimeError, EOFError, OSError, ValueError, KeyError, IndexError, AttributeError, TypeError) as error:
         raise WeightsError(f"{path}: is not a PyTorch checkpoint, or is truncated") from error
@@ -312,10 +312,10 @@ def _read_pickle(path: Path) -> dict[str, Tensor]:
         state = state["state_dict"]
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()) or not state:
         raise WeightsError(f"{path}: is a pickle, but not a state dict of tensors")
-    state = {str(key): value for key, value in state.items()}
-    if all(key.startswith("module.") for key in state):  # saved from a distributed wrapper
-        state = {key.removeprefix("module."): value for key, value in state.items()}
-    return state
+    tensors: dict[str, Tensor] = {str(key): value for key, value in state.items()}
+    if all(key.startswith("module.") for key in tensors):  # saved from a distributed wrapper
+        tensors = {key.removeprefix("module."): value for key, value in tensors.items()}
+    return tensors
 
 
 def _guess_variant(state: Mapping[str, Tensor], source: Path) -> str:
