@@ -1,0 +1,539 @@
+"""Data sets at training resolution, packed into WebDataset shards: written once, read back fast and in any order.
+
+    OUT/prepared.json                 canvas, classes, how images are stored
+    OUT/{split}-000000.tar            per image NAME.jpg (or NAME.image.npy), NAME.drivable.npy, NAME.lane.npy,
+                                      NAME.valid.npy (where there are such masks) and NAME.json
+    OUT/{split}-000000.index.jsonl    per image a line: where its parts are in the shard, and its boxes and attributes
+
+Images are resized to fit the canvas but not padded. Masks are packed bits along rows (`numpy.packbits`, axis 1). The
+shards are plain WebDataset ones, for any other reader; with the index beside them they are read in any order, by the
+same loader as everything else.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import contextlib
+import dataclasses
+import functools
+import io
+import json
+import logging
+import multiprocessing
+import shutil
+import tarfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.config import Task
+from trilitenet.data.description import read_description
+from trilitenet.data.reading import (
+    DETECTION_FOLDER,
+    DRIVABLE_FOLDER,
+    IMAGE_FOLDER,
+    LANE_FOLDER,
+    DrivingDataset,
+    SampleSource,
+    decode_image,
+)
+from trilitenet.data.sample import Sample
+from trilitenet.errors import DataError, OutputError, import_extra
+from trilitenet.processing.letterbox import Letterbox
+
+__all__ = ["PREPARED_FILE", "PreparedDataset", "is_prepared", "open_dataset", "prepare", "shrink"]
+
+_logger = logging.getLogger(__name__)
+
+PREPARED_FILE: Final = "prepared.json"
+CACHE_FOLDER: Final = ".prepared"
+"""A prepared copy in this folder of a data set is used by itself."""
+FORMAT: Final = 1
+
+_MASKS: Final = ("drivable", "lane", "valid")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Plan:
+    """What a shard is made with."""
+
+    root: Path
+    out: Path
+    canvas: tuple[int, int]
+    class_names: tuple[str, ...]
+    images: Literal["jpeg", "raw"]
+    quality: int
+    mask_above: int
+
+
+def shrink(sample: Sample, canvas: tuple[int, int], mask_above: int = 1) -> Sample:
+    """Resize a sample to fit a canvas, without padding: what the training transform does first.
+
+    Args:
+        sample: Of any size.
+        canvas: (height, width) in pixels.
+        mask_above: An area-resized mask pixel (0 to 255) above this is foreground.
+    """
+    box = Letterbox.fit(sample.size, canvas=canvas)
+    height, width = box.resized
+    if (height, width) == sample.size:
+        return sample
+    bare = dataclasses.replace(box, canvas=box.resized, top=0, left=0)
+    factor = np.array([width / sample.size[1], height / sample.size[0]] * 2)
+
+    def mask(values: NDArray[np.uint8] | None, above: int) -> NDArray[np.uint8] | None:
+        return None if values is None else bare.mask(values * np.uint8(255), above)
+
+    own = None if sample.valid is None else mask((~sample.valid).view(np.uint8), 1)
+    return dataclasses.replace(
+        sample,
+        image=bare.image(sample.image),
+        boxes=None if sample.boxes is None else (sample.boxes * factor).astype(np.float32),
+        ignored=(sample.ignored * factor).astype(np.float32),
+        drivable=mask(sample.drivable, mask_above),
+        lane=mask(sample.lane, mask_above),
+        valid=None if own is None else own == 0,
+    )
+
+
+def prepare(
+    root: str | Path,
+    out: str | Path | None = None,
+    *,
+    canvas: tuple[int, int] = (384, 640),
+    class_names: Sequence[str] | None = None,
+    splits: Iterable[str] | None = None,
+    images: Literal["jpeg", "raw"] = "jpeg",
+    quality: int = 95,
+    mask_above: int = 1,
+    shard_size: int = 1000,
+    workers: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, int]:
+    """Pack a data set at training resolution. Shards that are there already are kept.
+
+    Args:
+        root: A data set in the published layout.
+        out: Folder to write; ``root/.prepared`` if left out, which loading then uses by itself.
+        canvas: (height, width) that training will use.
+        class_names: Detection classes; those of ``dataset.yaml``.
+        splits: Only these; all if left out.
+        images: ``jpeg`` is small and quick to read; ``raw`` is about ten times larger and exact.
+        quality: Of the JPEGs, of 100.
+        mask_above: An area-resized mask pixel (0 to 255) above this is foreground (the published rule: 1).
+        shard_size: Images a shard.
+        workers: Processes; 0 works in this one.
+        progress: Called with (images done, images in all).
+
+    Returns:
+        Split -> number of images.
+
+    Raises:
+        OutputError: If ``out`` holds something else, or was made with other settings.
+        DataError: If the data set is broken.
+    """
+    root = Path(root)
+    out = Path(out) if out is not None else root / CACHE_FOLDER
+    names = tuple(class_names or read_description(root).class_names)
+    plan = _Plan(root, out, canvas, names, images, quality, mask_above)
+    folders = sorted(path.name for path in (root / IMAGE_FOLDER).glob("*") if path.is_dir())
+    chosen = list(splits) if splits is not None else folders
+    if not chosen:
+        raise DataError(f"{root}: no splits below {IMAGE_FOLDER}; expected the published layout, see docs/data.md")
+    datasets = {split: DrivingDataset(root, split, class_names=names) for split in chosen}
+    _open_out(plan)
+    jobs = [
+        (split, number, dataset.names[first : first + shard_size])
+        for split, dataset in datasets.items()
+        for number, first in enumerate(range(0, len(dataset), shard_size))
+    ]
+    total = sum(map(len, datasets.values()))
+    done = 0
+    for count in _run_jobs(plan, jobs, workers):
+        done += count
+        if progress:
+            progress(done, total)
+    _write_state(plan, datasets)
+    return {split: len(dataset) for split, dataset in datasets.items()}
+
+
+def is_prepared(root: str | Path) -> bool:
+    """Return whether a folder holds a prepared data set."""
+    return (Path(root) / PREPARED_FILE).is_file()
+
+
+def open_dataset(
+    root: str | Path,
+    split: str,
+    *,
+    canvas: tuple[int, int] | None = None,
+    class_names: Sequence[str] | None = None,
+    classes: Mapping[str, Sequence[str]] | None = None,
+    tasks: Sequence[Task] | None = None,
+) -> DrivingDataset | PreparedDataset:
+    """Open a split of a data set, whatever its layout.
+
+    A prepared data set is read as such. For one in the published layout, the prepared copy in its ``.prepared`` is used
+    if it is for this canvas and these classes and the data set has not changed since.
+
+    Args:
+        root: The data set.
+        split: The split.
+        canvas: (height, width) that the samples will be brought to; None reads the images as they are.
+        class_names: Detection classes; those of the data set if left out.
+        classes: Class name -> categories; with it, no prepared copy is used.
+        tasks: Read the labels of these alone.
+
+    Raises:
+        DataError: If there is no such split.
+    """
+    root = Path(root)
+    if is_prepared(root):
+        prepared = PreparedDataset(root, split, class_names=class_names, tasks=tasks)
+        if canvas is not None and prepared.canvas != canvas:
+            _logger.warning("%s: prepared for %s, used at %s", root, prepared.canvas, canvas)
+        return prepared
+    cache = root / CACHE_FOLDER
+    if canvas is not None and classes is None and is_prepared(cache):
+        state = _read_state(cache)
+        wanted = list(class_names or read_description(root).class_names)
+        if state["canvas"] != list(canvas) or state["class_names"] != wanted or split not in state["splits"]:
+            _logger.info("%s: the prepared copy is for something else and is not used", root)
+        elif state["splits"][split] != _fingerprint(root, split):
+            _logger.warning("%s: changed since it was prepared; run `trilitenet data prepare` again", root)
+        else:
+            return PreparedDataset(cache, split, tasks=tasks)
+    return DrivingDataset(root, split, class_names=class_names, classes=classes, tasks=tasks)
+
+
+class PreparedDataset:
+    """One split of a prepared data set.
+
+    Args:
+        root: The folder with ``prepared.json``, or the address of one (``https://...``), whose shards are then copied
+            to ``cache`` when they are first used.
+        split: The split.
+        class_names: Must be those it was prepared with, if given.
+        tasks: Read the labels of these alone.
+        cache: Where copies of remote shards go.
+
+    Raises:
+        DataError: If there is no such split, or the classes differ.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        split: str,
+        *,
+        class_names: Sequence[str] | None = None,
+        tasks: Sequence[Task] | None = None,
+        cache: str | Path | None = None,
+    ) -> None:
+        self._place = _Place(str(root), None if cache is None else Path(cache))
+        self.split = split
+        state = _read_state(self._place.file(PREPARED_FILE).parent)
+        self.canvas: tuple[int, int] = (state["canvas"][0], state["canvas"][1])
+        self._class_names = tuple(state["class_names"])
+        if class_names is not None and tuple(class_names) != self._class_names:
+            raise DataError(
+                f"{root}: prepared with the classes {self._class_names}, not {tuple(class_names)}; prepare it again"
+            )
+        if split not in state["shards"]:
+            raise DataError(f"{root}: no split {split!r}; there are {', '.join(state['shards']) or 'none'}")
+        self._tasks = None if tasks is None else frozenset(tasks)
+        self._lines: list[bytes] = []
+        self._shard_of: list[int] = []
+        self._shards: list[str] = state["shards"][split]
+        for number, shard in enumerate(self._shards):
+            lines = self._place.file(_index_name(shard)).read_bytes().splitlines()
+            self._lines += lines
+            self._shard_of += [number] * len(lines)
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names that ``Sample.class_id`` indexes."""
+        return self._class_names
+
+    @functools.cached_property
+    def names(self) -> list[str]:
+        """The images' names."""
+        return [json.loads(line)["name"] for line in self._lines]
+
+    def __len__(self) -> int:
+        return len(self._lines)
+
+    def __iter__(self) -> Iterator[Sample]:
+        return (self[index] for index in range(len(self)))
+
+    def attributes(self, index: int) -> dict[str, str]:
+        """Return the attributes of an image without decoding it."""
+        attributes: dict[str, str] = json.loads(self._lines[index])["attributes"]
+        return attributes
+
+    def __getitem__(self, index: int) -> Sample:
+        """Read a sample.
+
+        Raises:
+            DataError: If its shard is missing or broken.
+        """
+        entry = json.loads(self._lines[index])
+        shard = _map_shard(self._place.file(self._shards[self._shard_of[index]]))
+        height, width = entry["size"]
+        parts = {key: shard[start : start + length] for key, (start, length) in entry["parts"].items()}
+        if "image.npy" in parts:
+            # A copy: the pages of the file belong to everybody.
+            image = parts["image.npy"].reshape(height, width, 3).copy()
+        else:
+            image = decode_image(parts["jpg"], entry["name"])
+        masks: dict[str, NDArray[np.uint8] | None] = {}
+        for key in _MASKS:
+            packed = parts.get(f"{key}.npy")
+            if packed is None or (key != "valid" and self._tasks is not None and key not in self._tasks):
+                masks[key] = None
+            else:
+                masks[key] = np.unpackbits(packed.reshape(height, -1), axis=1, count=width)
+        labelled = entry["boxes"] is not None and (self._tasks is None or "detection" in self._tasks)
+        valid = masks["valid"]
+        return Sample(
+            name=entry["name"],
+            image=image,
+            boxes=np.array(entry["boxes"], np.float32).reshape(-1, 4) if labelled else None,
+            class_id=np.array(entry["class_id"], np.int64) if labelled else None,
+            ignored=np.array(entry["ignored"], np.float32).reshape(-1, 4),
+            drivable=masks["drivable"],
+            lane=masks["lane"],
+            valid=None if valid is None else valid.view(np.bool_),
+            attributes=entry["attributes"],
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Place:
+    """A folder, or the address of one whose files are copied when they are needed."""
+
+    root: str
+    cache: Path | None
+
+    def file(self, name: str) -> Path:
+        """Return a file's path on this machine.
+
+        Raises:
+            DataError: If it is not there.
+        """
+        if "://" not in self.root:
+            path = Path(self.root) / name
+            if not path.is_file():
+                raise DataError(f"{path}: missing; make it with `trilitenet data prepare`")
+            return path
+        if self.cache is None:
+            raise DataError(f"{self.root}: give `cache`, a folder for copies of remote shards")
+        path = self.cache / name
+        if not path.is_file():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part = path.with_name(f".{path.name}.part")
+            opener = import_extra("webdataset", "data").gopen
+            try:
+                with opener(f"{self.root.rstrip('/')}/{name}") as source, part.open("wb") as target:
+                    shutil.copyfileobj(source, target)
+            except (OSError, ValueError) as error:
+                raise DataError(f"{self.root}/{name}: cannot be fetched ({error})") from error
+            part.replace(path)
+        return path
+
+
+@functools.lru_cache(maxsize=512)
+def _map_shard(path: Path) -> NDArray[np.uint8]:
+    try:
+        return np.asarray(np.memmap(path, np.uint8, "r"))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read ({error}); prepare the data set again") from error
+
+
+def _run_jobs(plan: _Plan, jobs: list[tuple[str, int, list[str]]], workers: int) -> Iterator[int]:
+    if workers <= 0 or len(jobs) < 2:
+        for job in jobs:
+            yield _write_shard(plan, *job)
+        return
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
+        futures = [pool.submit(_write_shard, plan, *job) for job in jobs]
+        for future in concurrent.futures.as_completed(futures):
+            yield future.result()
+
+
+def _write_shard(plan: _Plan, split: str, number: int, names: list[str]) -> int:
+    """Write one shard and its index, unless they are there for these images; return the number of images."""
+    path = plan.out / f"{split}-{number:06}.tar"
+    index = plan.out / _index_name(path.name)
+    dataset = DrivingDataset(plan.root, split, class_names=plan.class_names, names=names)
+    if path.is_file() and index.is_file():
+        there = [json.loads(line)["name"] for line in index.read_bytes().splitlines()]
+        if there == names and index.stat().st_mtime >= _newest(dataset):
+            return len(names)
+    part = path.with_name(f".{path.name}.part")
+    entries: list[dict[str, Any]] = []
+    with tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as tar:
+        for sample in dataset:
+            members, entry = _encode(shrink(sample, plan.canvas, plan.mask_above), plan)
+            for ending, data in members.items():
+                member = tarfile.TarInfo(f"{_key(sample.name)}.{ending}")
+                member.size = len(data)
+                tar.addfile(member, io.BytesIO(data))
+            entries.append(entry)
+    _locate(part, entries)
+    index_part = index.with_name(f".{index.name}.part")
+    index_part.write_text("".join(json.dumps(entry) + "\n" for entry in entries), encoding="utf-8")
+    part.replace(path)
+    index_part.replace(index)
+    return len(names)
+
+
+def _encode(sample: Sample, plan: _Plan) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """Return a sample's files and its line of the index (where the files are is not known yet)."""
+    members: dict[str, bytes] = {}
+    if plan.images == "raw":
+        members["image.npy"] = _npy(sample.image)
+    else:
+        bgr = cv2.cvtColor(sample.image, cv2.COLOR_RGB2BGR)
+        members["jpg"] = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, plan.quality])[1].tobytes()
+    for key in _MASKS:
+        mask = getattr(sample, key)
+        if mask is not None:
+            members[f"{key}.npy"] = _npy(np.packbits(mask, axis=1))
+    labels = {
+        "name": sample.name,
+        "size": list(sample.size),
+        "boxes": None if sample.boxes is None else [[float(v) for v in box] for box in sample.boxes],
+        "class_id": None if sample.class_id is None else sample.class_id.tolist(),
+        "ignored": [[float(v) for v in box] for box in sample.ignored],
+        "class_names": plan.class_names,
+        "attributes": sample.attributes,
+    }
+    members["json"] = json.dumps(labels).encode()
+    del labels["class_names"]
+    return members, labels
+
+
+def _locate(path: Path, entries: list[dict[str, Any]]) -> None:
+    """Note in each entry where its parts are in the shard; arrays without their NumPy header."""
+    by_key = {_key(entry["name"]): entry for entry in entries}
+    for entry in entries:
+        entry["parts"] = {}
+    with tarfile.open(path) as tar, path.open("rb") as file:
+        for member in tar:
+            key, _, ending = member.name.partition(".")
+            if ending == "json":
+                continue
+            start, length = member.offset_data, member.size
+            if ending.endswith("npy"):
+                file.seek(start)
+                version = np.lib.format.read_magic(file)
+                if version != (1, 0):
+                    raise DataError(f"{path}: unexpected version of the NumPy format {version}")
+                np.lib.format.read_array_header_1_0(file)
+                length -= file.tell() - start
+                start = file.tell()
+            by_key[key]["parts"][ending] = [start, length]
+
+
+def _key(name: str) -> str:
+    """Return a WebDataset key: what comes before the first dot is the sample's name, so there is none in it."""
+    return name.replace("%", "%25").replace(".", "%2E")
+
+
+def _npy(array: NDArray[Any]) -> bytes:
+    stream = io.BytesIO()
+    np.lib.format.write_array(stream, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
+    return stream.getvalue()
+
+
+def _index_name(shard: str) -> str:
+    return f"{shard.removesuffix('.tar')}.index.jsonl"
+
+
+def _settings(plan: _Plan) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "canvas": list(plan.canvas),
+        "class_names": list(plan.class_names),
+        "images": plan.images,
+        "quality": plan.quality,
+        "mask_above": plan.mask_above,
+    }
+
+
+def _open_out(plan: _Plan) -> None:
+    state = plan.out / PREPARED_FILE
+    if state.is_file():
+        there = _read_state(plan.out)
+        if {key: there.get(key) for key in _settings(plan)} != _settings(plan):
+            raise OutputError(f"{plan.out}: was prepared with other settings; remove it or choose another folder")
+    elif plan.out.is_dir() and any(plan.out.iterdir()):
+        raise OutputError(f"{plan.out}: is not empty and not prepared earlier; choose another folder")
+    plan.out.mkdir(parents=True, exist_ok=True)
+    if not state.is_file():
+        state.write_text(json.dumps({**_settings(plan), "splits": {}, "shards": {}}), encoding="utf-8")
+
+
+def _write_state(plan: _Plan, datasets: Mapping[str, SampleSource]) -> None:
+    there = _read_state(plan.out)
+    splits, shards = dict(there["splits"]), dict(there["shards"])
+    for split, dataset in datasets.items():
+        splits[split] = _fingerprint(plan.root, split)
+        found = sorted(path.name for path in plan.out.glob(f"{split}-[0-9]*.tar"))
+        kept, count = [], 0
+        for name in found:
+            if count < len(dataset):
+                kept.append(name)
+                count += len((plan.out / _index_name(name)).read_bytes().splitlines())
+            else:  # of an earlier, larger data set
+                (plan.out / name).unlink()
+                (plan.out / _index_name(name)).unlink(missing_ok=True)
+        shards[split] = kept
+    text = json.dumps({**_settings(plan), "splits": splits, "shards": shards}, indent=1, sort_keys=True)
+    part = plan.out / f".{PREPARED_FILE}.part"
+    part.write_text(text, encoding="utf-8")
+    part.replace(plan.out / PREPARED_FILE)
+
+
+def _read_state(folder: Path) -> dict[str, Any]:
+    path = folder / PREPARED_FILE
+    try:
+        state: dict[str, Any] = json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read ({error}); prepare the data set again") from error
+    if state.get("format") != FORMAT:
+        raise DataError(f"{path}: format {state.get('format')!r}, not {FORMAT}; prepare the data set again")
+    return state
+
+
+def _files_of(root: Path, split: str) -> Iterator[Path]:
+    for folder in (IMAGE_FOLDER, DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER):
+        if (root / folder / split).is_dir():
+            yield from (root / folder / split).iterdir()
+    for name in ("dataset.yaml", "index.csv"):
+        if (root / name).is_file():
+            yield root / name
+
+
+def _fingerprint(root: Path, split: str) -> list[int]:
+    """Return what changes when a split changes: number of files, their bytes, and when the newest was written."""
+    stats = [path.stat() for path in _files_of(root, split)]
+    return [len(stats), sum(stat.st_size for stat in stats), max((stat.st_mtime_ns for stat in stats), default=0)]
+
+
+def _newest(dataset: DrivingDataset) -> float:
+    """Return when the newest of a data set's files was written, in seconds."""
+    newest = 0.0
+    for index, name in enumerate(dataset.names):
+        paths = [dataset.image_path(index), dataset.root / DETECTION_FOLDER / dataset.split / f"{name}.json"]
+        paths += [dataset.root / folder / dataset.split / f"{name}.png" for folder in (DRIVABLE_FOLDER, LANE_FOLDER)]
+        for path in paths:
+            with contextlib.suppress(FileNotFoundError):
+                newest = max(newest, path.stat().st_mtime)
+    return newest

@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+import torch
+
+from tests.data.published import write_published
+from trilitenet.data.batches import Batch
+from trilitenet.data.loader import build_loader, epoch_order
+from trilitenet.data.reading import DrivingDataset, MixedDataset
+from trilitenet.data.transforms import Augmentation, EvalTransform, TrainTransform
+from trilitenet.errors import ConfigError
+
+CANVAS = (64, 96)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> DrivingDataset:
+    root = tmp_path_factory.mktemp("data")
+    write_published(root, "train", 14)
+    return DrivingDataset(root, "train")
+
+
+def same(one: Batch, two: Batch) -> bool:
+    tensors = ("images", "boxes", "ignored", "detection_labelled", "drivable", "lane")
+    return one.names == two.names and all(torch.equal(getattr(one, key), getattr(two, key)) for key in tensors)
+
+
+def test_epochs_differ_and_repeat(dataset: DrivingDataset) -> None:
+    loader = build_loader(dataset, TrainTransform(CANVAS), batch_size=4, seed=3)
+    assert len(loader) == 3  # the last, half batch is left out
+    first, again, other = (list(loader.epoch(epoch)) for epoch in (0, 0, 1))
+    assert all(same(one, two) for one, two in zip(first, again, strict=True))
+    assert not any(same(one, two) for one, two in zip(first, other, strict=True))
+    seeded = list(build_loader(dataset, TrainTransform(CANVAS), batch_size=4, seed=4).epoch(0))
+    assert not any(same(one, two) for one, two in zip(first, seeded, strict=True))
+
+
+@pytest.mark.parametrize("start", [0, 1, 2, 3])
+def test_taking_an_epoch_up_in_its_middle(dataset: DrivingDataset, start: int) -> None:
+    augmentation = Augmentation(mosaic=0.5, mixup=0.5, rain=0.3)
+    loader = build_loader(dataset, TrainTransform(CANVAS, augmentation), batch_size=4, seed=3)
+    whole = list(loader.epoch(5))
+    rest = list(loader.epoch(5, start=start))
+    assert len(rest) == 3 - start
+    assert all(same(one, two) for one, two in zip(whole[start:], rest, strict=True))
+
+
+@pytest.mark.slow
+def test_workers_change_nothing(dataset: DrivingDataset) -> None:
+    augmentation = Augmentation(mosaic=0.5, noise=0.5)
+    alone = build_loader(dataset, TrainTransform(CANVAS, augmentation), batch_size=4, seed=3)
+    workers = build_loader(dataset, TrainTransform(CANVAS, augmentation), batch_size=4, seed=3, workers=2)
+    for epoch, start in ((0, 0), (1, 2)):
+        pairs = zip(alone.epoch(epoch, start=start), workers.epoch(epoch, start=start), strict=True)
+        assert all(same(one, two) for one, two in pairs)
+
+
+def test_without_shuffling_all_come_in_order(dataset: DrivingDataset) -> None:
+    loader = build_loader(dataset, EvalTransform(CANVAS), batch_size=4, shuffle=False)
+    assert [name for batch in loader for name in batch.names] == dataset.names
+    assert len(loader) == 4
+
+
+def test_a_small_set_is_not_dropped_whole(dataset: DrivingDataset) -> None:
+    small = DrivingDataset(dataset.root, "train", names=dataset.names[:3])
+    assert [len(batch) for batch in build_loader(small, EvalTransform(CANVAS), batch_size=16)] == [3]
+
+
+def test_order_is_a_permutation_without_weights() -> None:
+    for epoch in range(5):
+        order = epoch_order(100, seed=1, epoch=epoch)
+        assert sorted(order.tolist()) == list(range(100))
+    assert len({tuple(epoch_order(100, seed=1, epoch=epoch)) for epoch in range(5)}) == 5
+
+
+def test_weights_set_how_often() -> None:
+    weights = np.array([1.0, 1.0, 2.0, 0.0, 0.5])
+    total: Counter[int] = Counter()
+    for epoch in range(200):
+        order = epoch_order(5, seed=0, epoch=epoch, weights=weights, length=9)
+        counts = Counter(order.tolist())
+        assert len(order) == 9
+        for index, weight in enumerate(weights):
+            assert np.floor(weight * 2) <= counts[index] <= np.ceil(weight * 2), (epoch, counts)
+        total += counts
+    assert total[3] == 0
+    assert total[4] / total[0] == pytest.approx(0.5, abs=0.05)
+    assert total[2] / total[0] == pytest.approx(2.0, abs=0.1)
+
+
+def test_weights_of_mixed_data_sets_are_used(dataset: DrivingDataset) -> None:
+    rare = DrivingDataset(dataset.root, "train", names=dataset.names[:2])
+    mixed = MixedDataset([(rare, 6.0), (dataset, 1.0)])
+    loader = build_loader(mixed, EvalTransform(CANVAS), batch_size=2)
+    names = Counter(name for batch in loader.epoch(0) for name in batch.names)
+    assert names[dataset.names[0]] >= 3
+    equal = build_loader(MixedDataset([(rare, 2.0), (dataset, 2.0)]), EvalTransform(CANVAS), batch_size=2)
+    assert set(Counter(name for batch in equal.epoch(0) for name in batch.names).values()) == {1, 2}
+
+
+def test_length_of_an_epoch(dataset: DrivingDataset) -> None:
+    loader = build_loader(dataset, EvalTransform(CANVAS), batch_size=4, samples_per_epoch=40)
+    assert len(loader) == 10
+    counts = Counter(name for batch in loader.epoch(0) for name in batch.names)
+    assert set(counts.values()) <= {2, 3}
+
+
+def test_settings_are_checked(dataset: DrivingDataset) -> None:
+    with pytest.raises(ConfigError, match="batch_size"):
+        build_loader(dataset, EvalTransform(CANVAS), batch_size=0)
+    with pytest.raises(ConfigError, match="needs shuffle"):
+        build_loader(dataset, EvalTransform(CANVAS), batch_size=1, shuffle=False, samples_per_epoch=4)
+    for weights in (np.ones(3), np.zeros(14), -np.ones(14)):
+        with pytest.raises(ConfigError, match="weights must be 14"):
+            build_loader(dataset, EvalTransform(CANVAS), batch_size=1, weights=weights)

@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from tests.data.published import write_published
+from trilitenet.data.loader import build_loader
+from trilitenet.data.prepared import PreparedDataset, open_dataset, prepare
+from trilitenet.data.reading import DrivingDataset
+from trilitenet.data.transforms import TrainTransform
+from trilitenet.errors import DataError, OutputError
+
+CANVAS = (64, 96)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    root = tmp_path / "data"
+    write_published(root, "train", 11)
+    write_published(root, "val", 3, (50, 90))
+    mask = np.zeros((72, 128), np.uint8)
+    mask[60:] = 255
+    cv2.imwrite(str(root / "bonnet.png"), mask)
+    (root / "dataset.yaml").write_text("ego_masks: {train_000: bonnet.png}\n")
+    return root
+
+
+@pytest.mark.parametrize("images", ["raw", "jpeg"])
+def test_training_sees_the_same_batches(root: Path, tmp_path: Path, images: str) -> None:
+    counts = prepare(root, tmp_path / "out", canvas=CANVAS, images=images, shard_size=4)  # type: ignore[arg-type]
+    assert counts == {"train": 11, "val": 3}
+    assert len(list((tmp_path / "out").glob("train-*.tar"))) == 3
+    raw = DrivingDataset(root, "train")
+    packed = open_dataset(tmp_path / "out", "train", canvas=CANVAS)
+    assert isinstance(packed, PreparedDataset)
+    transform = TrainTransform(CANVAS)
+    loaders = [build_loader(dataset, transform, batch_size=3, seed=4) for dataset in (raw, packed)]
+    for one, two in zip(*(loader.epoch(2) for loader in loaders), strict=True):
+        assert one.names == two.names
+        difference = (one.images.int() - two.images.int()).abs()
+        assert difference.max() == 0 if images == "raw" else difference.float().mean() < 4
+        for field in ("drivable", "lane", "detection_labelled"):
+            assert torch.equal(getattr(one, field), getattr(two, field)), field
+        torch.testing.assert_close(one.boxes, two.boxes, atol=1e-3, rtol=0)
+        torch.testing.assert_close(one.ignored, two.ignored, atol=1e-3, rtol=0)
+
+
+def test_attributes_tasks_and_missing_labels(root: Path, tmp_path: Path) -> None:
+    prepare(root, tmp_path / "out", canvas=CANVAS)
+    raw, packed = DrivingDataset(root, "train"), PreparedDataset(tmp_path / "out", "train")
+    assert packed.names == raw.names
+    for index in range(len(raw)):
+        assert packed.attributes(index) == raw.attributes(index)
+        one, two = raw[index], packed[index]
+        for field in ("boxes", "class_id", "drivable", "lane", "valid"):
+            assert (getattr(one, field) is None) == (getattr(two, field) is None), field
+    lanes = PreparedDataset(tmp_path / "out", "train", tasks=["lane"])[0]
+    assert lanes.boxes is None
+    assert lanes.drivable is None
+    assert lanes.lane is not None
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # webdataset leaves files open
+def test_webdataset_reads_the_shards(root: Path, tmp_path: Path) -> None:
+    """They are ordinary shards, for readers that know nothing of the index."""
+    webdataset = pytest.importorskip("webdataset")
+    prepare(root, tmp_path / "out", canvas=CANVAS, splits=["val"])
+    packed = PreparedDataset(tmp_path / "out", "val")
+    shards = str(tmp_path / "out/val-000000.tar")
+    for raw, sample in zip(webdataset.WebDataset(shards, shardshuffle=False).decode("rgb8"), packed, strict=True):
+        assert raw["__key__"] == sample.name
+        assert raw["jpg"].shape == sample.image.shape
+        assert np.abs(raw["jpg"].astype(int) - sample.image).max() <= 3  # another JPEG decoder
+        assert raw["json"]["class_names"] == ["vehicle"]
+        if sample.drivable is not None:
+            width = sample.size[1]
+            np.testing.assert_array_equal(np.unpackbits(raw["drivable.npy"], axis=1, count=width), sample.drivable)
+
+
+def test_a_data_set_uses_its_prepared_copy_by_itself(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    prepare(root, canvas=CANVAS)
+    assert isinstance(open_dataset(root, "train", canvas=CANVAS), PreparedDataset)
+    assert isinstance(open_dataset(root, "train"), DrivingDataset)  # wanted as they are
+    assert isinstance(open_dataset(root, "train", canvas=(96, 96)), DrivingDataset)
+    assert isinstance(open_dataset(root, "train", canvas=CANVAS, class_names=["car"]), DrivingDataset)
+    path = root / "da_seg_annotations/train/train_0000.png"
+    path.unlink()
+    with caplog.at_level(logging.WARNING):
+        assert isinstance(open_dataset(root, "train", canvas=CANVAS), DrivingDataset)
+    assert "changed since it was prepared" in caplog.text
+
+
+def test_twice_changes_nothing_and_changes_are_seen(root: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    prepare(root, out, canvas=CANVAS, shard_size=4)
+    before = {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in out.glob("train-*")}
+    prepare(root, out, canvas=CANVAS, shard_size=4)
+    assert {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in out.glob("train-*")} == before
+    # A mask of the second shard is drawn anew, and an image of the last one goes.
+    path = root / "da_seg_annotations/train/train_0004.png"
+    cv2.imwrite(str(path), np.zeros((72, 128), np.uint8))
+    later = (out / "prepared.json").stat().st_mtime + 10
+    os.utime(path, (later, later))
+    (root / "images/train/train_0010.jpg").unlink()
+    prepare(root, out, canvas=CANVAS, shard_size=4)
+    after = {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in out.glob("train-*")}
+    assert after["train-000000.tar"] == before["train-000000.tar"]
+    assert after["train-000001.tar"] != before["train-000001.tar"]
+    packed = PreparedDataset(out, "train")
+    assert len(packed) == 10
+    drivable = packed[4].drivable
+    assert drivable is not None
+    assert not drivable.any()
+
+
+def test_remote_shards_are_copied_when_used(root: Path, tmp_path: Path) -> None:
+    pytest.importorskip("webdataset")
+    prepare(root, tmp_path / "out", canvas=CANVAS)
+    address = (tmp_path / "out").as_uri()
+    remote = PreparedDataset(address, "val", cache=tmp_path / "copies")
+    np.testing.assert_array_equal(remote[1].image, PreparedDataset(tmp_path / "out", "val")[1].image)
+    assert not (tmp_path / "copies/train-000000.tar").exists()
+    with pytest.raises(DataError, match="give `cache`"):
+        PreparedDataset(address, "val")
+
+
+@pytest.mark.slow
+def test_processes_write_the_same_shards(root: Path, tmp_path: Path) -> None:
+    prepare(root, tmp_path / "one", canvas=CANVAS, shard_size=4)
+    prepare(root, tmp_path / "two", canvas=CANVAS, shard_size=4, workers=2)
+    for path in (tmp_path / "one").iterdir():
+        assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes(), path.name
+
+
+def test_errors(root: Path, tmp_path: Path) -> None:
+    prepare(root, tmp_path / "out", canvas=CANVAS)
+    with pytest.raises(OutputError, match="other settings"):
+        prepare(root, tmp_path / "out", canvas=(96, 96))
+    with pytest.raises(OutputError, match="not empty"):
+        prepare(root, root)
+    with pytest.raises(DataError, match="no split 'test'"):
+        PreparedDataset(tmp_path / "out", "test")
+    with pytest.raises(DataError, match="prepared with the classes"):
+        PreparedDataset(tmp_path / "out", "val", class_names=["car"])
+    (tmp_path / "out/val-000000.tar").unlink()
+    with pytest.raises(DataError, match=r"val-000000\.tar: missing"):
+        PreparedDataset(tmp_path / "out", "val")[0]
+    (tmp_path / "out/prepared.json").write_text("{}")
+    with pytest.raises(DataError, match="format None"):
+        PreparedDataset(tmp_path / "out", "val")

@@ -1,0 +1,216 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.data.published import write_annotation, write_published
+from trilitenet.data.description import (
+    DatasetDescription,
+    MaskMeaning,
+    class_table,
+    read_description,
+    write_description,
+)
+from trilitenet.data.reading import DrivingDataset, MixedDataset, decode_image, sampling_weights
+from trilitenet.data.sample import Sample
+from trilitenet.errors import DataError, ShapeError
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    write_published(tmp_path, "train", 8)
+    return tmp_path
+
+
+def box(category: str, x: float, *, crowd: bool = False) -> dict[str, object]:
+    corners = {"x1": x, "y1": 1.0, "x2": x + 10, "y2": 21.0}
+    return {"category": category, "box2d": corners, "attributes": {"crowd": crowd}}
+
+
+def test_any_subset_of_the_tasks(root: Path) -> None:
+    dataset = DrivingDataset(root, "train")
+    assert dataset.names == [f"train_{index:04}" for index in range(8)]
+    for index, sample in enumerate(dataset):
+        assert sample.size == (72, 128)
+        assert (sample.drivable is None) == (index % 4 == 3)
+        assert (sample.lane is None) == (index % 5 == 4)
+        assert (sample.boxes is None) == (index % 7 == 6)
+        if sample.drivable is not None:
+            assert set(np.unique(sample.drivable)) == {0, 1}
+
+
+def test_an_image_is_rgb(root: Path) -> None:
+    red = np.zeros((72, 128, 3), np.uint8)
+    red[..., 2] = 255  # OpenCV writes BGR
+    cv2.imwrite(str(root / "images/train/red.png"), red)
+    dataset = DrivingDataset(root, "train", names=["red"])
+    assert dataset[0].image[5, 5].tolist() == [255, 0, 0]
+    assert dataset[0].boxes is None
+
+
+def test_categories_crowds_and_boxes_beyond_the_image(root: Path) -> None:
+    items = [
+        box("car", 0),
+        box("train", 20),
+        box("person", 40),
+        box("bus", 60, crowd=True),
+        box("person", 9, crowd=True),
+    ]
+    items += [box("truck", 120), box("car", 300)]
+    write_annotation(root, "train", "train_0000", items, weather="clear")
+    sample = DrivingDataset(root, "train")[0]
+    assert sample.boxes is not None
+    assert sample.boxes[:, 0].tolist() == [0, 20, 120]
+    assert sample.boxes[2].tolist() == [120, 1, 128, 21]
+    assert sample.ignored.tolist() == [[60, 1, 70, 21]]
+    assert sample.attributes == {"weather": "clear"}
+    two = DrivingDataset(root, "train", class_names=["person", "heavy"], classes={"heavy": ["bus", "truck", "train"]})[
+        0
+    ]
+    assert two.class_id is not None
+    assert two.class_id.tolist() == [1, 0, 1]
+    assert len(two.ignored) == 2
+
+
+def test_index_gives_attributes(root: Path) -> None:
+    (root / "index.csv").write_text(
+        "name,split,source,condition\ntrain_0001,train,city,night\ntrain_0001,val,other,day\n"
+    )
+    dataset = DrivingDataset(root, "train")
+    assert dataset.attributes(1) == {"timeofday": "night", "source": "city", "condition": "night"}
+    assert dataset[1].attributes == dataset.attributes(1)
+    (root / "index.csv").write_text("hello\n")
+    with pytest.raises(DataError, match="'name' and 'split'"):
+        DrivingDataset(root, "train")
+
+
+def test_ego_mask_by_camera(root: Path) -> None:
+    own = np.zeros((36, 64), np.uint8)  # of another size: it is resized
+    own[30:] = 255
+    cv2.imwrite(str(root / "car.png"), own)
+    (root / "dataset.yaml").write_text("ego_masks: {train_0000: car.png}\n")
+    dataset = DrivingDataset(root, "train")
+    valid = dataset[0].valid
+    assert valid is not None
+    assert valid[:60].all()
+    assert not valid[60:].any()
+    assert dataset[1].valid is None
+    (root / "dataset.yaml").write_text("ego_mask: gone.png\n")
+    with pytest.raises(DataError, match=r"gone\.png"):
+        DrivingDataset(root, "train")[0]
+
+
+def test_mask_values_have_a_meaning(root: Path) -> None:
+    mask = np.zeros((72, 128), np.uint8)
+    mask[0], mask[1], mask[2], mask[3] = 1, 2, 64, 255
+    cv2.imwrite(str(root / "da_seg_annotations/train/train_0000.png"), mask)
+    plain = DrivingDataset(root, "train")[0]
+    assert plain.drivable is not None
+    assert plain.drivable[:4, 0].tolist() == [0, 1, 1, 1]  # the published rule: above 1
+    assert plain.valid is None
+    write_description(root, DatasetDescription(drivable=MaskMeaning(above=0, ignore=(64,)), tasks=("drivable",)))
+    sample = DrivingDataset(root, "train")[0]
+    assert sample.drivable is not None
+    assert sample.drivable[:4, 0].tolist() == [1, 1, 0, 1]
+    assert sample.valid is not None
+    assert np.flatnonzero(~sample.valid.all(axis=1)).tolist() == [2]
+    assert sample.boxes is None
+    assert sample.lane is None
+
+
+def test_description_round_trip(tmp_path: Path) -> None:
+    description = DatasetDescription(
+        name="mine",
+        classes={"car": ("car", "van"), "person": ("pedestrian",)},
+        splits=("train",),
+        drivable=MaskMeaning(values={255: "direct"}),
+        licence="CC BY 4.0",
+    )
+    write_description(tmp_path, description)
+    assert read_description(tmp_path) == description
+    assert read_description(tmp_path).class_names == ("car", "person")
+    (tmp_path / "dataset.yaml").write_text("clases: {}\n")
+    with pytest.raises(DataError, match="did you mean 'classes'"):
+        read_description(tmp_path)
+    (tmp_path / "dataset.yaml").write_text("a: [")
+    with pytest.raises(DataError, match="not YAML"):
+        read_description(tmp_path)
+    with pytest.raises(DataError, match="both"):
+        class_table(("a", "b"), {"a": ("x",), "b": ("x",)})
+
+
+def test_errors_name_the_file(root: Path) -> None:
+    with pytest.raises(DataError, match="no folder images/val"):
+        DrivingDataset(root, "val")
+    with pytest.raises(DataError, match="no image 'x'"):
+        DrivingDataset(root, "train", names=["x"])
+    (root / "images/empty").mkdir()
+    with pytest.raises(DataError, match="no images"):
+        DrivingDataset(root, "empty")
+    dataset = DrivingDataset(root, "train")
+    cv2.imwrite(str(root / "ll_seg_annotations/train/train_0000.png"), np.zeros((3, 4), np.uint8))
+    with pytest.raises(DataError, match="mask of 4x3 for an image of 128x72"):
+        dataset[0]
+    (root / "da_seg_annotations/train/train_0001.png").write_bytes(b"")
+    with pytest.raises(DataError, match=r"train_0001\.png: not a mask"):
+        dataset[1]
+    (root / "images/train/train_0002.jpg").write_bytes(b"\xff\xd8 broken")
+    with pytest.raises(DataError, match=r"train_0002\.jpg: not an image"):
+        dataset[2]
+    (root / "det_annotations/train/train_0003.json").write_text("{")
+    with pytest.raises(DataError, match=r"train_0003\.json: not JSON"):
+        dataset[3]
+    (root / "det_annotations/train/train_0004.json").write_text('{"frames": [{"objects": [{"box2d": {}}]}]}')
+    with pytest.raises(DataError, match="train_0004: not an annotation"):
+        dataset[4]
+    with pytest.raises(DataError, match="not an image"):
+        decode_image(b"", "nothing")
+
+
+def test_mixed_data_sets(root: Path, tmp_path: Path) -> None:
+    write_published(tmp_path / "other", "train", 3)
+    one, two = DrivingDataset(root, "train"), DrivingDataset(tmp_path / "other", "train")
+    mixed = MixedDataset([(one, 1.0), (two, 4.0)])
+    assert len(mixed) == 11
+    np.testing.assert_array_equal(mixed[9].image, two[1].image)
+    assert mixed.attributes(8) == two.attributes(0)
+    assert mixed.weights.tolist() == [1.0] * 8 + [4.0] * 3
+    weights = sampling_weights(mixed, {"timeofday": {"night": 2.0}})
+    assert weights.tolist() == [1, 2, 1, 2, 1, 2, 1, 2, 4, 8, 4]
+    with pytest.raises(IndexError):
+        mixed[11]
+    with pytest.raises(DataError, match="above 0"):
+        MixedDataset([(one, 0.0)])
+    with pytest.raises(DataError, match="at least one"):
+        MixedDataset([])
+    with pytest.raises(DataError, match="different classes"):
+        MixedDataset([(one, 1.0), (DrivingDataset(root, "train", class_names=["car"]), 1.0)])
+    with pytest.raises(DataError, match="negative"):
+        sampling_weights(one, {"timeofday": {"night": -1.0}})
+    with pytest.raises(DataError, match="every sampling weight is 0"):
+        sampling_weights(one, {"timeofday": {"night": 0.0, "day": 0.0, "": 0.0}})
+
+
+def test_a_sample_is_checked() -> None:
+    image = np.zeros((4, 6, 3), np.uint8)
+    with pytest.raises(ShapeError, match="uint8"):
+        Sample("x", image.astype(np.float32))
+    with pytest.raises(ShapeError, match="go together"):
+        Sample("x", image, boxes=np.zeros((0, 4), np.float32))
+    with pytest.raises(ShapeError, match="N class ids"):
+        Sample("x", image, boxes=np.zeros((2, 4), np.float32), class_id=np.zeros(1, np.int64))
+    with pytest.raises(ShapeError, match="lane must be"):
+        Sample("x", image, lane=np.zeros((6, 4), np.uint8))
+    with pytest.raises(ShapeError, match="ignored"):
+        Sample("x", image, ignored=np.zeros((1, 5), np.float32))
+
+
+def test_driving_frames(driving: Path) -> None:
+    train, val = DrivingDataset(driving, "train"), DrivingDataset(driving, "val")
+    assert (len(train), len(val)) == (2164, 439)
+    samples = [val[index] for index in range(0, len(val), 20)]
+    assert all(sample.boxes is not None for sample in samples)
+    assert {sample.attributes["condition"] for sample in samples} >= {"day", "night"}
