@@ -306,7 +306,9 @@ class _Job:
             try:
                 for source in self.sources:
                     self._run_source(source, predictor, progress, hide, window)
-            except (KeyboardInterrupt, _WindowClosed):
+            except _WindowClosed:
+                pass
+            except KeyboardInterrupt:
                 interrupted = True
         return PredictReport(
             images=self.images,
@@ -388,9 +390,7 @@ class _Job:
             self.frames += 1
 
 
-def _follow(
-    perception: Perception, parts: tuple[Steady | None, RoadMonitor | None]
-) -> tuple[Perception, Road | None]:
+def _follow(perception: Perception, parts: tuple[Steady | None, RoadMonitor | None]) -> tuple[Perception, Road | None]:
     """Return a perception with what its video adds to it, and its road."""
     steady, monitor = parts
     if steady is not None:
@@ -405,13 +405,15 @@ def _names(source: Stills | FrameReader) -> list[str]:
 def _allot_stems(names: Sequence[str]) -> dict[str, str]:
     """Return a file name without ending for each source; the second ``a`` becomes ``a-2``."""
     stems: dict[str, str] = {}
-    for name in names:
+    taken: set[str] = set()
+    for name in dict.fromkeys(names):
         stem = PurePath(name).stem or "image"
         number, chosen = 1, stem
-        while chosen in stems.values():
+        while chosen in taken:
             number += 1
             chosen = f"{stem}-{number}"
-        stems.setdefault(name, chosen)
+        stems[name] = chosen
+        taken.add(chosen)
     return stems
 
 
