@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 from trilitenet.errors import ConfigError, InputError, import_extra
@@ -78,6 +79,8 @@ def serve(
     )
     set_up_logs(log_level.upper())
     cv2.setNumThreads(1)  # images are the unit of parallel work here
+    # The network's thread takes Python's lock often and briefly; with the usual 5 ms each other thread delays it.
+    sys.setswitchinterval(0.0005)
     predictor = load(model, device=device, backend=backend, confidence=confidence)
     with predictor:
         build_server(create_app(predictor, Path(model).stem, settings), host, port).run()
