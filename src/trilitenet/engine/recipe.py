@@ -76,7 +76,7 @@ class TrainConfig:
     sampling: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)
     samples_per_epoch: int | None = None
     input_size: tuple[int, int] = (384, 640)
-    augmentation: Augmentation = Augmentation()
+    augmentation: Augmentation = Augmentation()  # noqa: RUF009 - frozen, so shared safely
     variant: str = "tiny"
     tasks: tuple[Task, ...] = TASKS
     pcaa: bool = True

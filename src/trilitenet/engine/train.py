@@ -26,7 +26,7 @@ from trilitenet.losses.multitask import LossTerms, MultiTaskLoss
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
 from trilitenet.models.weights import save_network
 
-__all__ = ["CHECKPOINT_NAME", "RunLogger", "Trainer", "TrainResult"]
+__all__ = ["CHECKPOINT_NAME", "RunLogger", "TrainResult", "Trainer"]
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
+from torch.nn import functional as F  # noqa: N812
 
 from trilitenet.config import STRIDES
 from trilitenet.errors import ConfigError, ShapeError
@@ -246,14 +246,14 @@ class DetectionLoss(nn.Module):
         weight = found.valid.to(output.dtype)
         number = weight.sum().clamp(min=1)
 
-        chosen = output[found.image, found.anchor, found.row, found.column]  # (M, 5 + classes)
+        flat = ((found.image * anchors + found.anchor) * rows + found.row) * columns + found.column
+        chosen = output.reshape(-1, output.shape[-1]).index_select(0, flat)  # (M, 5 + classes)
         centre = 2 * chosen[:, 0:2].sigmoid() - 0.5
         size = (2 * chosen[:, 2:4].sigmoid()).square() * sizes[found.anchor]
         overlap = complete_iou(torch.cat([centre, size], dim=1), found.box)
         box = ((1 - overlap) * weight).sum() / number
 
         with torch.no_grad():
-            flat = ((found.image * anchors + found.anchor) * rows + found.row) * columns + found.column
             blank = torch.zeros(images * anchors * rows * columns, dtype=output.dtype, device=output.device)
             target = blank.scatter_reduce(0, flat, overlap.clamp(min=0) * weight, "amax")
             matched = blank.scatter_reduce(0, flat, weight, "amax") > 0

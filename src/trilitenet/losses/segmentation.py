@@ -6,17 +6,21 @@ the vehicle itself.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, Final, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812
 
 from trilitenet.errors import ShapeError
 
 __all__ = ["IGNORED", "SegmentationLoss", "SegmentationTerms", "focal_loss", "tversky_loss"]
 
-IGNORED = 255
+IGNORED: Final = 255
 """Value of a mask's pixels that count for nothing."""
+
+EPS: Final = 1e-7
+"""Least denominator of the Tversky index."""
 
 
 class SegmentationTerms(NamedTuple):
@@ -26,29 +30,11 @@ class SegmentationTerms(NamedTuple):
     tversky: Tensor
 
 
-def _check(logits: Tensor, target: Tensor) -> None:
-    if logits.ndim != 4 or logits.shape[1] != 2 or target.shape != logits[:, 0].shape:
-        raise ShapeError(
-            f"logits must be (B, 2, H, W) and the target (B, H, W), got {tuple(logits.shape)} and {tuple(target.shape)}"
-        )
-
-
-def _one_hot(target: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Return (B, 2, H, W) one-hot targets (background, foreground) and (B, 1, H, W) weights 0 or 1."""
-    weight = (target != IGNORED).to(dtype)[:, None]
-    foreground = (target == 1).to(dtype)[:, None]
-    return torch.cat([weight - foreground, foreground], dim=1), weight
-
-
-def _full(logits: Tensor) -> Tensor:
-    return logits if logits.dtype is torch.float64 else logits.float()
-
-
 def focal_loss(logits: Tensor, target: Tensor, alpha: float = 0.25, gamma: float = 2.0) -> Tensor:
     """Return the focal loss (Lin et al., 2017): binary, with logits, for each of the two channels, summed.
 
-    FL = -alpha_t (1 - p_t)^gamma log p_t, averaged over the pixels that count; alpha_t is ``alpha`` where the channel is
-    the truth and 1 - ``alpha`` elsewhere.
+    FL = -alpha_t (1 - p_t)^gamma log p_t, averaged over the pixels that count; alpha_t is ``alpha`` where the channel
+    is the truth and 1 - ``alpha`` elsewhere.
 
     Args:
         logits: (B, 2, H, W): background, foreground.
@@ -59,24 +45,14 @@ def focal_loss(logits: Tensor, target: Tensor, alpha: float = 0.25, gamma: float
     Raises:
         ShapeError: If the shapes do not fit.
     """
-    _check(logits, target)
-    with torch.autocast(device_type=logits.device.type, enabled=False):
-        logits = _full(logits)
-        truth, weight = _one_hot(target, logits.dtype)
-        signed = logits * (2 * truth - 1)  # the logit of what is true
-        log_p = torch.nn.functional.logsigmoid(signed)
-        balance = alpha * truth + (1 - alpha) * (1 - truth)
-        loss = -balance * (1 - log_p.exp()).pow(gamma) * log_p
-        return (loss * weight).sum() / weight.sum().clamp(min=1)
+    return SegmentationLoss(0.5, 0.5, focal_alpha=alpha, focal_gamma=gamma)(logits, target).focal
 
 
-def tversky_loss(
-    logits: Tensor, target: Tensor, alpha: float = 0.7, beta: float = 0.3, gamma: float = 4 / 3, eps: float = 1e-7
-) -> Tensor:
+def tversky_loss(logits: Tensor, target: Tensor, alpha: float = 0.7, beta: float = 0.3, gamma: float = 4 / 3) -> Tensor:
     """Return the focal Tversky loss (Salehi et al., 2017): the whole batch is one region.
 
-    With the soft-max over the channels, T = TP / (TP + alpha FP + beta FN) for each class; the mean over both classes of
-    1 - T (0 for a class without a pixel) is raised to ``gamma``.
+    With the soft-max over the channels, T = TP / (TP + alpha FP + beta FN) for each class; the mean over both classes
+    of 1 - T (0 for a class without a pixel) is raised to ``gamma``.
 
     Args:
         logits: (B, 2, H, W): background, foreground.
@@ -84,22 +60,11 @@ def tversky_loss(
         alpha: Weight of false positives.
         beta: Weight of false negatives.
         gamma: Exponent of the mean, at least 1.
-        eps: Least denominator.
 
     Raises:
         ShapeError: If the shapes do not fit.
     """
-    _check(logits, target)
-    with torch.autocast(device_type=logits.device.type, enabled=False):
-        logits = _full(logits)
-        truth, weight = _one_hot(target, logits.dtype)
-        probability = logits.softmax(dim=1) * weight
-        hit = (probability * truth).sum(dim=(0, 2, 3))
-        wrong = probability.sum(dim=(0, 2, 3)) - hit
-        present = truth.sum(dim=(0, 2, 3))
-        score = hit / (hit + alpha * wrong + beta * (present - hit)).clamp(min=eps)
-        loss = ((1 - score) * (present > 0)).mean()
-        return loss.clamp(min=0).pow(gamma)
+    return SegmentationLoss(alpha, beta, tversky_gamma=gamma)(logits, target).tversky
 
 
 class SegmentationLoss(nn.Module):
@@ -130,8 +95,82 @@ class SegmentationLoss(nn.Module):
         self.tversky_gamma = tversky_gamma
 
     def forward(self, logits: Tensor, target: Tensor) -> SegmentationTerms:
-        """Compute both terms of (B, 2, H, W) logits against a (B, H, W) target of 0, 1 and 255."""
-        return SegmentationTerms(
-            focal_loss(logits, target, self.focal_alpha, self.focal_gamma),
-            tversky_loss(logits, target, self.alpha, self.beta, self.tversky_gamma),
-        )
+        """Compute both terms of (B, 2, H, W) logits against a (B, H, W) target of 0, 1 and 255, in 32-bit floats.
+
+        Raises:
+            ShapeError: If the shapes do not fit.
+        """
+        if logits.ndim != 4 or logits.shape[1] != 2 or target.shape != logits[:, 0].shape:
+            raise ShapeError(
+                "logits must be (B, 2, H, W) and the target (B, H, W), "
+                f"got {tuple(logits.shape)} and {tuple(target.shape)}"
+            )
+        with torch.autocast(device_type=logits.device.type, enabled=False):
+            sums = _Sums.apply(logits, target, self.focal_alpha, self.focal_gamma)
+            focal_sum, hit, wrong, foreground, background = sums.unbind()
+            focal = focal_sum / (foreground + background).clamp(min=1)
+            # Two channels that sum to 1: what is wrong in one class is missed in the other.
+            of_foreground = self._index(hit, wrong, foreground - hit)
+            of_background = self._index(background - wrong, foreground - hit, wrong)
+            losses = (1 - of_foreground) * (foreground > 0) + (1 - of_background) * (background > 0)
+            return SegmentationTerms(focal, (losses / 2).clamp(min=0).pow(self.tversky_gamma))
+
+    def _index(self, hit: Tensor, wrong: Tensor, missed: Tensor) -> Tensor:
+        return hit / (hit + self.alpha * wrong + self.beta * missed).clamp(min=EPS)
+
+
+class _Sums(torch.autograd.Function):
+    """The five sums over pixels that both losses are made of, with their gradient in closed form.
+
+    One pass over the pixels, an image at a time on a CPU so that it stays in the cache. (5,): the focal loss, the soft
+    foreground on foreground pixels, the soft foreground on background pixels, foreground and background pixels.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, logits: Tensor, target: Tensor, alpha: float, gamma: float) -> Tensor:
+        dtype = torch.promote_types(logits.dtype, torch.float32)
+        sums = torch.zeros(5, dtype=dtype, device=logits.device)
+        # Gradients by the logits: of the focal sum, and of the soft foreground by the difference of the logits.
+        of_focal = torch.empty_like(logits)
+        of_soft = torch.empty_like(target, dtype=logits.dtype)
+        step = 1 if logits.device.type == "cpu" else len(logits)
+        for first in range(0, len(logits), step):
+            part = slice(first, first + step)
+            labels = target[part]
+            foreground = (labels == 1).to(dtype)
+            weight = (labels != IGNORED).to(dtype)
+            background = weight - foreground
+            planes = [logits[part, channel].to(dtype) for channel in (0, 1)]
+            for channel, truth in enumerate((background, foreground)):
+                sign = 2 * truth - 1
+                x = planes[channel] * sign  # the logit of what is true
+                log_p = F.logsigmoid(x)
+                p = log_p.exp()
+                miss = 1 - p
+                factor = (miss if gamma == 1 else miss.pow(gamma)) * ((2 * alpha - 1) * truth + (1 - alpha)) * weight
+                sums[0] -= (factor * log_p).sum()
+                of_focal[part, channel] = factor.mul_(p.mul_(log_p).mul_(gamma).sub_(miss)).mul_(sign)
+            soft = (planes[1] - planes[0]).sigmoid_()
+            sums[1] += (soft * foreground).sum()
+            sums[2] += (soft * background).sum()
+            sums[3] += foreground.sum()
+            sums[4] += background.sum()
+            of_soft[part] = soft.addcmul_(soft, soft, value=-1)
+        ctx.save_for_backward(of_focal, of_soft, target)
+        return sums
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
+        of_focal, of_soft, target = ctx.saved_tensors
+        focal, hit, wrong = grad[:3].to(of_focal.dtype).unbind()
+        result = torch.empty_like(of_focal)
+        step = 1 if result.device.type == "cpu" else len(result)
+        for first in range(0, len(result), step):
+            part = slice(first, first + step)
+            labels = target[part]
+            by_label = (labels == 1).to(result.dtype) * (hit - wrong) + (labels != IGNORED).to(result.dtype) * wrong
+            soft = by_label.mul_(of_soft[part])
+            torch.sub(of_focal[part, 0] * focal, soft, out=result[part, 0])
+            torch.add(of_focal[part, 1] * focal, soft, out=result[part, 1])
+        return result, None, None, None

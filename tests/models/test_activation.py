@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812
+
+from trilitenet.models.activation import PReLU, batch_norm_prelu
+
+
+def case(channels: int, dtype: torch.dtype, memory_format: torch.memory_format) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(channels)
+    shape = (2, channels, 8, 12)
+    x = torch.randn(shape, generator=generator, dtype=torch.float64) * 2 + 1
+    grad = torch.randn(shape, generator=generator, dtype=torch.float64)
+    return (
+        x.to(dtype).contiguous(memory_format=memory_format).requires_grad_(),
+        grad.to(dtype).contiguous(memory_format=memory_format),
+    )
+
+
+def layers(channels: int, dtype: torch.dtype) -> tuple[nn.BatchNorm2d, PReLU]:
+    torch.manual_seed(channels)
+    bn, act = nn.BatchNorm2d(channels, eps=1e-3, momentum=0.03), PReLU(channels)
+    for parameter in (bn.weight, bn.bias, act.weight):
+        nn.init.normal_(parameter)
+    return bn.to(dtype), act.to(dtype)
+
+
+@pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
+@pytest.mark.parametrize("channels", [2, 4, 8])
+def test_equals_the_plain_layers(channels: int, memory_format: torch.memory_format) -> None:
+    x, grad = case(channels, torch.float64, memory_format)
+    bn, act = layers(channels, torch.float64)
+    other, _ = layers(channels, torch.float64)
+    out = batch_norm_prelu(bn, act, x)
+    expected = F.prelu(other(x), act.weight)
+    torch.testing.assert_close(out, expected)
+    torch.testing.assert_close(dict(bn.named_buffers()), dict(other.named_buffers()))
+    ours = torch.autograd.grad(out, [x, bn.weight, bn.bias, act.weight], grad)
+    theirs = torch.autograd.grad(expected, [x, other.weight, other.bias, act.weight], grad)
+    torch.testing.assert_close(ours, theirs)
+
+
+def test_keeps_the_memory_format_and_type() -> None:
+    x, _ = case(2, torch.bfloat16, torch.channels_last)
+    bn, act = layers(2, torch.float32)
+    out = batch_norm_prelu(bn, act, x)
+    assert out.dtype is torch.bfloat16
+    assert out.is_contiguous(memory_format=torch.channels_last)
+    assert act(x).is_contiguous(memory_format=torch.channels_last)
+
+
+def test_evaluation_uses_the_running_statistics() -> None:
+    x, _ = case(4, torch.float32, torch.channels_last)
+    bn, act = layers(4, torch.float32)
+    bn.running_mean = torch.full((4,), 0.5)
+    bn.eval(), act.eval()
+    torch.testing.assert_close(batch_norm_prelu(bn, act, x), F.prelu(bn(x), act.weight))
+
+
+def test_gradient_at_zero_is_that_of_pytorch() -> None:
+    x = torch.zeros(1, 2, 2, 2).contiguous(memory_format=torch.channels_last).requires_grad_()
+    act = PReLU(2)
+    (ours,) = torch.autograd.grad(act(x).sum(), x)
+    (theirs,) = torch.autograd.grad(F.prelu(x, act.weight).sum(), x)
+    torch.testing.assert_close(ours, theirs)
