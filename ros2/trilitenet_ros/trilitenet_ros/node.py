@@ -1,0 +1,93 @@
+"""The node: subscribes to a camera, publishes what is seen. All logic is in `trilitenet_ros.messages`.
+
+Subscribes to ``image`` (sensor_msgs/Image). Publishes ``~/detections`` (vision_msgs/Detection2DArray), ``~/drivable``
+and ``~/lane_markings`` (sensor_msgs/Image, mono8), ``~/lane_left`` and ``~/lane_right`` (nav_msgs/Path in the vehicle's
+frame, once the camera is known). Advisory only: no safety function may rest on it.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Path
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image
+from vision_msgs.msg import Detection2D, Detection2DArray, ObjectHypothesisWithPose
+
+import trilitenet
+from trilitenet.road.camera import read_camera
+from trilitenet.road.monitor import RoadMonitor
+from trilitenet_ros.messages import Types, fill_detections, fill_mask, fill_path, read_image
+
+TYPES = Types(Image, Detection2DArray, Detection2D, ObjectHypothesisWithPose, Path, PoseStamped)
+
+# Only the newest picture counts: while one is worked on, older ones are dropped instead of queued.
+NEWEST = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+class PerceptionNode(Node):
+    """Sees every picture of a camera that it has time for."""
+
+    def __init__(self) -> None:
+        super().__init__("trilitenet")
+        confidence = self.declare_parameter("confidence", -1.0).value
+        camera_file = self.declare_parameter("camera_file", "").value
+        self._vehicle_frame = self.declare_parameter("vehicle_frame", "base_link").value
+        self._publish_masks = self.declare_parameter("publish_masks", True).value
+        self._predictor = trilitenet.load(
+            self.declare_parameter("model", "small").value,
+            device=self.declare_parameter("device", "auto").value,
+            backend=self.declare_parameter("backend", "auto").value,
+            confidence=None if confidence < 0 else confidence,
+        )
+        self._monitor = RoadMonitor(read_camera(camera_file) if camera_file else None)
+        self._start: float | None = None
+        self._frame = 0
+        self._detections = self.create_publisher(Detection2DArray, "~/detections", 1)
+        self._masks = {name: self.create_publisher(Image, f"~/{name}", 1) for name in ("drivable", "lane_markings")}
+        self._lanes = [self.create_publisher(Path, f"~/lane_{side}", 1) for side in ("left", "right")]
+        self.create_subscription(Image, "image", self._on_image, NEWEST)
+        self.get_logger().info(f"ready: {self._predictor.backend.name}")
+
+    def _on_image(self, message: Image) -> None:
+        try:
+            pixels = read_image(message)
+        except ValueError as error:
+            self.get_logger().error(str(error), throttle_duration_sec=5.0)
+            return
+        seconds = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+        self._start = seconds if self._start is None else self._start
+        perception = dataclasses.replace(self._predictor(pixels), frame=self._frame, timestamp=seconds - self._start)
+        self._frame += 1
+        self._detections.publish(fill_detections(perception, message.header, TYPES))
+        if self._publish_masks:
+            for name, mask in (("drivable", perception.drivable), ("lane_markings", perception.lane)):
+                if mask is not None:
+                    self._masks[name].publish(fill_mask(mask, message.header, TYPES))
+        header = copy.deepcopy(message.header)
+        header.frame_id = self._vehicle_frame
+        for publisher, line in zip(self._lanes, self._monitor(perception).ego_lines, strict=True):
+            path = None if line is None else fill_path(line, header, TYPES)
+            if path is not None:
+                publisher.publish(path)
+
+
+def main() -> None:
+    """Run the node until it is stopped."""
+    rclpy.init()
+    node = PerceptionNode()
+    try:
+        rclpy.spin(node)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()

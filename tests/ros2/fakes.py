@@ -1,0 +1,117 @@
+"""Message classes with the fields, and the strictness about types, of those that ROS 2 generates."""
+
+from __future__ import annotations
+
+import array
+import types
+from typing import Any, ClassVar
+
+
+class Message:
+    """Takes only the fields of its definition, and only values of their types."""
+
+    fields: ClassVar[dict[str, type]] = {}
+
+    def __init__(self) -> None:
+        for name, kind in self.fields.items():
+            super().__setattr__(name, array.array("B") if kind is array.array else kind())
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        assert name in self.fields, f"{type(self).__name__} has no field {name}"
+        kind = self.fields[name]
+        assert isinstance(value, kind), (
+            f"{type(self).__name__}.{name} takes {kind.__name__}, got {type(value).__name__}"
+        )
+        super().__setattr__(name, value)
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(f"{type(self).__name__} has no field {name}")
+
+
+def _message(name: str, **fields: type) -> type[Message]:
+    return type(name, (Message,), {"fields": fields})
+
+
+Time = _message("Time", sec=int, nanosec=int)
+Header = _message("Header", stamp=Time, frame_id=str)
+Image = _message(
+    "Image", header=Header, height=int, width=int, encoding=str, is_bigendian=int, step=int, data=array.array
+)
+Point2D = _message("Point2D", x=float, y=float)
+Pose2D = _message("Pose2D", position=Point2D, theta=float)
+BoundingBox2D = _message("BoundingBox2D", center=Pose2D, size_x=float, size_y=float)
+ObjectHypothesis = _message("ObjectHypothesis", class_id=str, score=float)
+ObjectHypothesisWithPose = _message("ObjectHypothesisWithPose", hypothesis=ObjectHypothesis)
+Detection2D = _message("Detection2D", header=Header, results=list, bbox=BoundingBox2D, id=str)
+Detection2DArray = _message("Detection2DArray", header=Header, detections=list)
+Point = _message("Point", x=float, y=float, z=float)
+Quaternion = _message("Quaternion", x=float, y=float, z=float, w=float)
+Pose = _message("Pose", position=Point, orientation=Quaternion)
+PoseStamped = _message("PoseStamped", header=Header, pose=Pose)
+Path = _message("Path", header=Header, poses=list)
+
+
+class Publisher:
+    def __init__(self) -> None:
+        self.published: list[Any] = []
+
+    def publish(self, message: Any) -> None:
+        self.published.append(message)
+
+
+class Node:
+    """The part of rclpy's node that is used."""
+
+    def __init__(self, name: str) -> None:
+        self.publishers: dict[str, Publisher] = {}
+        self.subscriptions: dict[str, Any] = {}
+        self.messages: list[str] = []
+
+    overrides: ClassVar[dict[str, Any]] = {}
+
+    def declare_parameter(self, name: str, default: Any) -> Any:
+        return types.SimpleNamespace(value=self.overrides.get(name, default))
+
+    def create_publisher(self, kind: type, topic: str, depth: int) -> Publisher:
+        self.publishers[topic] = Publisher()
+        return self.publishers[topic]
+
+    def create_subscription(self, kind: type, topic: str, callback: Any, profile: Any) -> None:
+        self.subscriptions[topic] = callback
+
+    def get_logger(self) -> Any:
+        def log(text: str, **options: Any) -> None:
+            self.messages.append(text)
+
+        return types.SimpleNamespace(info=log, error=log)
+
+
+def modules() -> dict[str, types.ModuleType]:
+    """Return what ``import rclpy`` and the message packages would find."""
+
+    def module(name: str, **names: Any) -> types.ModuleType:
+        made = types.ModuleType(name)
+        made.__dict__.update(names)
+        return made
+
+    class Policy:
+        KEEP_LAST = BEST_EFFORT = 1
+
+    return {
+        "rclpy": module("rclpy"),
+        "rclpy.node": module("rclpy.node", Node=Node),
+        "rclpy.qos": module("rclpy.qos", HistoryPolicy=Policy, ReliabilityPolicy=Policy, QoSProfile=dict),
+        "geometry_msgs": module("geometry_msgs"),
+        "geometry_msgs.msg": module("geometry_msgs.msg", PoseStamped=PoseStamped),
+        "nav_msgs": module("nav_msgs"),
+        "nav_msgs.msg": module("nav_msgs.msg", Path=Path),
+        "sensor_msgs": module("sensor_msgs"),
+        "sensor_msgs.msg": module("sensor_msgs.msg", Image=Image),
+        "vision_msgs": module("vision_msgs"),
+        "vision_msgs.msg": module(
+            "vision_msgs.msg",
+            Detection2D=Detection2D,
+            Detection2DArray=Detection2DArray,
+            ObjectHypothesisWithPose=ObjectHypothesisWithPose,
+        ),
+    }
