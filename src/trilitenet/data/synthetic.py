@@ -8,16 +8,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.data.sample import Sample
+from trilitenet.data.synthetic_chance import random_world
 from trilitenet.data.synthetic_render import FIRST_VEHICLE, Rendering, render
 from trilitenet.data.synthetic_vehicles import VehiclePose
-from trilitenet.data.synthetic_world import World, random_world
+from trilitenet.data.synthetic_world import World
 from trilitenet.errors import ConfigError
 from trilitenet.processing.geometry import Camera
 
@@ -118,7 +118,7 @@ class Scene:
     truth: SceneTruth
 
 
-class SyntheticScenes(Sequence[Sample]):
+class SyntheticScenes:
     """Endless single road scenes.
 
     Args:
@@ -143,12 +143,12 @@ class SyntheticScenes(Sequence[Sample]):
             raise ConfigError(f"labels must be 'lines' or 'paint', got {labels!r}")
         if min(size) < 32:
             raise ConfigError(f"size must be at least 32 pixels each way, got {size}")
-        self.seed, self.size, self.count, self.labels, self.faults = seed, size, count, labels, faults
+        self.seed, self.size, self.length, self.labels, self.faults = seed, size, count, labels, faults
 
     def __len__(self) -> int:
-        return self.count
+        return self.length
 
-    def __getitem__(self, index: int) -> Sample:  # type: ignore[override]
+    def __getitem__(self, index: int) -> Sample:
         return self.scene(index).sample
 
     def scene(self, index: int) -> Scene:
@@ -157,8 +157,8 @@ class SyntheticScenes(Sequence[Sample]):
         Raises:
             IndexError: If it is out of range.
         """
-        if not 0 <= index < self.count:
-            raise IndexError(f"scene {index} of {self.count}")
+        if not 0 <= index < self.length:
+            raise IndexError(f"scene {index} of {self.length}")
         rng = np.random.default_rng((self.seed, index))
         world = random_world(rng, self.size)
         drawn = render(world, rng, faults=self.faults)
@@ -291,7 +291,7 @@ def _objects(world: World, drawn: Rendering) -> tuple[ObjectTruth, ...]:
 def _outline(camera: Camera, pose: VehiclePose) -> tuple[float, float, float, float] | None:
     """Return the box around the vehicle's eight corners in pixels; None if one is behind the camera."""
     low = pose.ground_box
-    high = low + (0.0, 0.0, pose.shape.height * pose.vehicle.scale)
+    high = low + np.array([0.0, 0.0, pose.shape.height * pose.vehicle.scale])
     pixels = camera.to_pixels(np.concatenate([low, high]))
     if np.isnan(pixels).any() or low[:, 0].min() < 0.5:
         return None

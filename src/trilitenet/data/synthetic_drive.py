@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
-from collections.abc import Sequence
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.data.synthetic import Scene, label_scene
+from trilitenet.data.synthetic_chance import random_layout, random_light, random_scenery, random_vehicle
 from trilitenet.data.synthetic_render import render
-from trilitenet.data.synthetic_world import (
-    FAR,
-    Course,
-    Item,
-    Layout,
-    Light,
-    Vehicle,
-    World,
-    random_layout,
-    random_light,
-    random_scenery,
-    random_vehicle,
-)
+from trilitenet.data.synthetic_world import FAR, Course, Item, Layout, Light, Vehicle, World
 from trilitenet.errors import ConfigError
 from trilitenet.processing.geometry import Camera
 
@@ -36,9 +25,11 @@ _CHUNK: Final = 150.0
 """Metres of scenery that are drawn up at once."""
 
 
-class SyntheticDrive(Sequence[Scene]):
-    """The frames of a drive in the middle of three lanes: another vehicle ahead, which the ego vehicle closes on, a
-    change to the lane on the left, and a second vehicle ahead there; traffic on the other lanes and against.
+class SyntheticDrive:
+    """The frames of a drive in the middle one of three lanes.
+
+    There is a vehicle ahead, which the ego vehicle closes on; a change to the lane on the left; a second vehicle ahead
+    there; and traffic on the other lanes and against.
 
     Args:
         seed: Another seed gives another road, light and traffic.
@@ -86,7 +77,7 @@ class SyntheticDrive(Sequence[Scene]):
     def __len__(self) -> int:
         return self.frames
 
-    def __getitem__(self, index: int) -> Scene:  # type: ignore[override]
+    def __getitem__(self, index: int) -> Scene:
         """Return frame ``index``.
 
         Raises:
@@ -109,10 +100,10 @@ class SyntheticDrive(Sequence[Scene]):
         travelled = self._speed * time
         offset, rate = self._aside(time)
         course = Course(lambda s: self._curvature(s + travelled), offset, math.atan2(rate, self._speed))
-        vehicles = [vehicle for actor in self._actors if (vehicle := actor(time, travelled)) is not None]
+        vehicles = [vehicle for actor in self._actors if (vehicle := actor(time)) is not None]
         first = int((travelled + 3) // _CHUNK)
         items = [
-            Item(item.kind, item.s + chunk * _CHUNK - travelled, item.d, item.width, item.height, item.style)
+            dataclasses.replace(item, s=item.s + chunk * _CHUNK - travelled)
             for chunk in range(first, first + 3)
             for item in _scenery(self.seed, chunk, self._layout)
         ]
@@ -155,7 +146,9 @@ class SyntheticDrive(Sequence[Scene]):
         actors: list[_Actor] = []
         width, speed = self._layout.lane_width, self._speed
 
-        def add(d: float, s: float, relative: float, *, wave: float = 0.0, heavy: float = 0.2, until: float = math.inf) -> None:
+        def add(
+            d: float, s: float, relative: float, *, wave: float = 0.0, heavy: float = 0.2, until: float = math.inf
+        ) -> None:
             number = len(actors) + 1
             model = random_vehicle(rng, 0.0, d, 0.0, heavy=heavy, number=number)
             actors.append(_Actor(model, s, relative, wave, float(rng.uniform(12, 18)), until, speed))
@@ -178,7 +171,9 @@ class SyntheticDrive(Sequence[Scene]):
             lane = self._layout.oncoming[int(rng.integers(len(self._layout.oncoming)))]
             number = len(actors) + 1
             model = random_vehicle(rng, 0.0, lane, math.pi, heavy=0.25, number=number)
-            actors.append(_Actor(model, 30 + 85.0 * i + float(rng.uniform(-25, 25)), -27.0 - speed, 0.0, 1.0, math.inf, speed))
+            actors.append(
+                _Actor(model, 30 + 85.0 * i + float(rng.uniform(-25, 25)), -27.0 - speed, 0.0, 1.0, math.inf, speed)
+            )
         return actors
 
 
@@ -191,18 +186,15 @@ class _Actor:
         self.model, self.start, self.relative, self.wave, self.period = model, start, relative, wave, period
         self.until, self.ego_speed = until, ego_speed
 
-    def __call__(self, time: float, travelled: float) -> Vehicle | None:
-        del travelled
+    def __call__(self, time: float) -> Vehicle | None:
         phase = 2 * math.pi * time / self.period
         s = self.start + self.relative * time + self.wave * math.sin(phase)
         rate = self.relative + self.wave * math.cos(phase) * 2 * math.pi / self.period
         if not 1.0 < s < FAR * 0.8:
             return None
         model = self.model
-        return Vehicle(
-            model.kind, s, model.d, model.yaw, model.colour, model.scale, rate < -2.5 and model.yaw == 0.0, model.number,
-            self.ego_speed + rate,
-        )  # fmt: skip
+        braking = rate < -2.5 and model.yaw == 0.0
+        return dataclasses.replace(model, s=s, braking=braking, speed=self.ego_speed + rate)
 
 
 @functools.lru_cache(maxsize=64)

@@ -82,8 +82,9 @@ def _car(
     outline = tuple(
         (x * length, z * height)
         for x, z in (
-            (0.0, 0.17), (0.0, 0.40), (0.012, boot_z), (boot, boot_z + 0.03), (rear, 0.985), ((rear + roof_front) / 2, 1.0),
-            (roof_front, 0.985), (screen, screen_z), (0.96, bonnet_z), (0.995, bonnet_z - 0.14), (1.0, 0.17),
+            (0.0, 0.17), (0.0, 0.40), (0.012, boot_z), (boot, boot_z + 0.03), (rear, 0.985),
+            ((rear + roof_front) / 2, 1.0), (roof_front, 0.985), (screen, screen_z), (0.96, bonnet_z),
+            (0.995, bonnet_z - 0.14), (1.0, 0.17),
         )
     )  # fmt: skip
     surfaces: tuple[Surface, ...] = (
@@ -152,7 +153,8 @@ def _truck(length: float, width: float, height: float, cab_height: float) -> Sha
         width=width * 0.88, surface="dark",
     )  # fmt: skip
     cab = Part(
-        ((split, 0.45), (split, cab_height), (length - 0.5, cab_height), (length - 0.08, cab_height * 0.56), (length, 0.45)),
+        ((split, 0.45), (split, cab_height), (length - 0.5, cab_height), (length - 0.08, cab_height * 0.56),
+         (length, 0.45)),
         ("body", "roof", "glass", "body"),
         (((split + 0.6, cab_height * 0.55), (split + 0.6, cab_height * 0.86), (length - 0.6, cab_height * 0.86),
           (length - 0.3, cab_height * 0.55)),),
@@ -191,6 +193,7 @@ class Lamp:
         radius: Of the lamp itself in pixels.
         colour: RGB.
         strength: How much it glares, about 0..1.
+        owner: Mark of what it belongs to in the map of objects: it shines only where that is not hidden.
     """
 
     u: float
@@ -198,6 +201,7 @@ class Lamp:
     radius: float
     colour: Colour
     strength: float
+    owner: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -233,7 +237,7 @@ class VehiclePose:
         )
 
     def projection(self, camera: Camera) -> Floats:
-        """Return (4, 3): takes (x, y, z, 1) of the shape's frame to homogeneous pixels, the last being depth in metres."""
+        """Return (4, 3): takes (x, y, z, 1) of the shape's frame to homogeneous pixels, the last being depth."""
         corners = self.place(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64))
         frame = np.concatenate([corners[1:] - corners[0], corners[:1] - (0.0, 0.0, camera.height)])
         return np.asarray(frame @ camera.rotation @ camera.matrix.T, np.float64)
@@ -275,8 +279,8 @@ def draw_shadow(image: NDArray[np.uint8], camera: Camera, pose: VehiclePose, dep
         mask = np.full(region.shape[:2], 255, np.uint8)
         level = int(255 * (1 - depth * share))
         cv2.fillPoly(mask, [_fixed(pixels - (left, top))], level, cv2.LINE_AA, _SHIFT)
-        if grow > 1.1 and min(mask.shape) > 4:
-            size = max(3, mask.shape[0] // 4 | 1)
+        if grow > 1.1 and min(bottom - top, right - left) > 4:
+            size = max(3, (bottom - top) // 4 | 1)
             mask = np.asarray(cv2.blur(mask, (size, size)), np.uint8)
         cv2.multiply(region, cv2.merge([mask, mask, mask]), dst=region, scale=1 / 255)
 
@@ -436,8 +440,8 @@ def _draw_part(
         pen.polygon(wall, colours[part.surface], bright)
         if fine and part.surface == "body":
             low = outline[:, 1].min()
-            sill = np.array([[outline[0, 0], side * half[0], low], [outline[0, 0], side * half[0], low + 0.16],
-                             [outline[-1, 0], side * half[-1], low + 0.16], [outline[-1, 0], side * half[-1], low]])  # fmt: skip
+            rear, front, top_edge = (outline[0, 0], side * half[0]), (outline[-1, 0], side * half[-1]), low + 0.16
+            sill = np.array([(*rear, low), (*rear, top_edge), (*front, top_edge), (*front, low)])
             pen.polygon(sill, vehicle.colour, bright * 0.55)
         for pane in part.windows:
             points = np.array(pane)
@@ -498,7 +502,7 @@ def _draw_lights(
             radius = pen.camera.fx * 0.09 / float(centre[0, 0])
             if rear_seen:
                 strength = 0.55 if vehicle.braking and lamps else 0.28
-                out.append(Lamp(float(u), float(v), radius, (255.0, 30.0, 20.0), strength))
+                out.append(Lamp(float(u), float(v), radius, (255.0, 30.0, 20.0), strength, pen.number))
             else:
-                out.append(Lamp(float(u), float(v), radius * 1.3, (255.0, 244.0, 225.0), 1.0))
+                out.append(Lamp(float(u), float(v), radius * 1.3, (255.0, 244.0, 225.0), 1.0, pen.number))
     return out

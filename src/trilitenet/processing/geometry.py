@@ -117,14 +117,14 @@ class Camera:
         yaw = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
         pitch = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
         roll = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
-        return yaw @ pitch @ roll @ axes
+        return np.asarray(yaw @ pitch @ roll @ axes, np.float64)
 
     @functools.cached_property
     def ground_homography(self) -> Floats:
         """(3, 3): takes (x, y, 1) on the road in metres to homogeneous pixels; an ideal lens is assumed."""
         to_camera = self.rotation.T
         columns = np.stack([to_camera[:, 0], to_camera[:, 1], -self.height * to_camera[:, 2]], axis=1)
-        return self.matrix @ columns
+        return np.asarray(self.matrix @ columns, np.float64)
 
     def rays(self, pixels: ArrayLike) -> Floats:
         """Return the directions that pixels look in.
@@ -142,7 +142,7 @@ class Camera:
         else:
             x = (points[:, 0] - self.cx) / self.fx
             y = (points[:, 1] - self.cy) / self.fy
-        return np.stack([x, y, np.ones_like(x)], axis=1) @ self.rotation.T
+        return np.asarray(np.stack([x, y, np.ones_like(x)], axis=1) @ self.rotation.T, np.float64)
 
     def to_ground(self, pixels: ArrayLike) -> Floats:
         """Return where pixels meet the flat road.
@@ -195,7 +195,7 @@ class Camera:
     def horizon(self, columns: ArrayLike) -> Floats:
         """Return the row of the horizon at each of the columns (an ideal lens is assumed)."""
         normal = np.linalg.inv(self.matrix).T @ self.rotation.T @ np.array([0.0, 0.0, 1.0])
-        return -(normal[0] * np.asarray(columns, np.float64) + normal[2]) / normal[1]
+        return np.asarray(-(normal[0] * np.asarray(columns, np.float64) + normal[2]) / normal[1], np.float64)
 
     def resized(self, size: tuple[int, int]) -> Camera:
         """Return the camera of the same view at another resolution.

@@ -132,8 +132,10 @@ def write_camera(camera: Camera, path: str | Path) -> None:
 
 
 class SelfCalibration:
-    """Estimates how the camera is mounted from the lanes alone: pitch and yaw from where they vanish, height from the
-    width of a lane. It trusts itself once enough frames agree.
+    """Estimates how the camera is mounted from the lanes alone.
+
+    Pitch and yaw follow from where they vanish, the height from the width of a lane. It trusts itself once enough
+    frames agree.
 
     The focal length cannot be seen from lanes: it follows from the assumed field of view, and its uncertainty goes into
     every distance. Offsets across the lane do not depend on it.
@@ -231,6 +233,14 @@ class View:
         """(height, width) in pixels."""
         return round((self.far - self.near) * self.scale), round(2 * self.half_width * self.scale)
 
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """(3, 3): takes (u, v, 1) of the picture from above to (x, y, 1) in metres."""
+        step = 1 / self.scale
+        return np.array(
+            [[0.0, -step, self.far - 0.5 * step], [-step, 0.0, self.half_width - 0.5 * step], [0.0, 0.0, 1.0]]
+        )
+
     def to_pixels(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return (N, 2) pixels u, v of the picture from above, of (N, 2) points x, y in metres."""
         u = (self.half_width - points[:, 1]) * self.scale - 0.5
@@ -255,12 +265,7 @@ def birds_eye(image: NDArray[np.uint8], camera: Camera, view: View | None = None
         camera = camera.resized(size)
     if camera.distortion:
         image = np.asarray(cv2.undistort(image, camera.matrix, np.array(camera.distortion)), np.uint8)
-    # Pixel of the picture from above -> metres -> pixel of the image.
-    step = 1 / view.scale
-    to_ground = np.array(
-        [[0.0, -step, view.far - 0.5 * step], [-step, 0.0, view.half_width - 0.5 * step], [0.0, 0.0, 1.0]]
-    )
-    matrix = camera.ground_homography @ to_ground
+    matrix = camera.ground_homography @ view.matrix
     height, width = view.size
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpPerspective(image, matrix, (width, height), flags=flags), np.uint8)

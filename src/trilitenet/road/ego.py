@@ -18,7 +18,16 @@ from trilitenet.road.camera import CameraErrors
 from trilitenet.road.structures import EgoLane, Estimate, GroundCurve, LaneLine, LeadVehicle
 from trilitenet.structures import Boxes
 
-__all__ = ["REACH", "REAR_OVERHANG", "LaneFit", "LeadFilter", "fit_ego_lane", "find_lead", "ground_curve"]
+__all__ = [
+    "REACH",
+    "REAR_OVERHANG",
+    "LaneFit",
+    "LeadFilter",
+    "find_distances",
+    "find_lead",
+    "fit_ego_lane",
+    "ground_curve",
+]
 
 Floats = NDArray[np.float64]
 
@@ -236,6 +245,22 @@ def find_lead(boxes: Boxes, fit: LaneFit, camera: Camera, errors: CameraErrors) 
     return best
 
 
+def find_distances(boxes: Boxes, camera: Camera, errors: CameraErrors) -> tuple[Estimate | None, ...]:
+    """Return metres to the nearest end of each vehicle; None for one that is cut off below or too far to tell."""
+    height, width = camera.size
+    left, _, right, bottom = boxes.xyxy.T.astype(np.float64) - 0.5
+    ground = camera.to_ground(np.stack([(left + right) / 2, bottom], axis=1))
+    found: list[Estimate | None] = []
+    for x, row in zip(ground[:, 0].tolist(), bottom.tolist(), strict=True):
+        estimate = None
+        if math.isfinite(x) and x > REAR_OVERHANG + 0.5 and row < height - 1.5:
+            error = _distance_error(x, camera, errors, BOX_ERROR * width / 640)
+            if error <= MAX_DISTANCE_ERROR * x:
+                estimate = Estimate(x - REAR_OVERHANG, error)
+        found.append(estimate)
+    return tuple(found)
+
+
 def _distance_error(x: float, camera: Camera, errors: CameraErrors, pixel: float) -> float:
     per_radian = (x * x + camera.height**2) / camera.height
     return math.sqrt(
@@ -246,8 +271,10 @@ def _distance_error(x: float, camera: Camera, errors: CameraErrors, pixel: float
 
 
 class LeadFilter:
-    """Follows the distance to one vehicle over time (a Kalman filter of distance and speed) for the closing speed and
-    the time to collision."""
+    """Follows the distance to one vehicle over time, for the closing speed and the time to collision.
+
+    It is a Kalman filter of distance and speed.
+    """
 
     ACCELERATION: Final = 2.0
     """Standard deviation of the relative acceleration in m/s^2."""

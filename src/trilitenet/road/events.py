@@ -9,11 +9,9 @@ import dataclasses
 from typing import Literal
 
 from trilitenet.errors import ConfigError
-from trilitenet.road.structures import Event, Road
+from trilitenet.road.structures import Event, EventKind, Road
 
 __all__ = ["EventDetector", "EventThresholds"]
-
-Kind = Literal["lane_departure_left", "lane_departure_right", "forward_collision"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +79,7 @@ class EventDetector:
 
     def __init__(self, thresholds: EventThresholds | None = None) -> None:
         self.thresholds = thresholds or EventThresholds()
-        self._states: dict[Kind, _State] = {
+        self._states: dict[EventKind, _State] = {
             "lane_departure_left": _State(),
             "lane_departure_right": _State(),
             "forward_collision": _State(),
@@ -106,12 +104,17 @@ class EventDetector:
                 events.append(Event(kind, phase, timestamp, frame, value, track))
         return tuple(events)
 
-    def _departures(self, road: Road) -> dict[Kind, tuple[bool | None, float]]:
+    @property
+    def warnings(self) -> tuple[EventKind, ...]:
+        """Kinds of events that are on."""
+        return tuple(kind for kind, state in self._states.items() if state.on)
+
+    def _departures(self, road: Road) -> dict[EventKind, tuple[bool | None, float]]:
         limits, lane = self.thresholds, road.ego_lane
         if lane is None or lane.offset is None or lane.width is None:
             return {"lane_departure_left": (None, 0.0), "lane_departure_right": (None, 0.0)}
-        found: dict[Kind, tuple[bool | None, float]] = {}
-        sides: tuple[tuple[Kind, float], ...] = (("lane_departure_left", 1.0), ("lane_departure_right", -1.0))
+        found: dict[EventKind, tuple[bool | None, float]] = {}
+        sides: tuple[tuple[EventKind, float], ...] = (("lane_departure_left", 1.0), ("lane_departure_right", -1.0))
         for kind, side in sides:
             room = lane.width.value / 2 - side * lane.offset.value - limits.vehicle_width / 2
             towards = lane.heading is not None and side * lane.heading.value > limits.drift

@@ -1,9 +1,10 @@
-"""Frame after frame of a video, or one picture, into what they tell of the road: the parts of this layer in their order."""
+"""Frame after frame of a video, or one picture, into what they tell of the road: this layer's parts in their order."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +13,11 @@ from trilitenet.errors import ShapeError
 from trilitenet.processing.geometry import Camera
 from trilitenet.processing.polygons import mask_to_polygons
 from trilitenet.road.camera import CameraErrors, SelfCalibration
-from trilitenet.road.ego import LaneFit, LeadFilter, find_lead, fit_ego_lane, ground_curve
+from trilitenet.road.ego import LaneFit, LeadFilter, find_distances, find_lead, fit_ego_lane, ground_curve
 from trilitenet.road.events import EventDetector, EventThresholds
 from trilitenet.road.lanes import assign_positions, find_lines, vanishing_point
 from trilitenet.road.structures import Estimate, LaneLine, Road
-from trilitenet.road.tracking import LineTracker, MaskSmoother, VehicleTracker
+from trilitenet.road.tracking import LineTracker
 from trilitenet.structures import Perception
 
 __all__ = ["RoadMonitor"]
@@ -27,8 +28,6 @@ class RoadMonitor:
 
     Args:
         camera: The camera, for any resolution of its view; estimated from the lanes if left out.
-        track: Give vehicles identities (needs the extra ``track``).
-        smoothing: Weight of the past in the masks, in [0, 1): 0 leaves them alone.
         thresholds: When events begin and end.
         field_of_view: Assumed horizontal field of view in degrees, without a camera.
         lane_width: Assumed width of a lane in metres, without a camera.
@@ -39,8 +38,6 @@ class RoadMonitor:
         self,
         camera: Camera | None = None,
         *,
-        track: bool = False,
-        smoothing: float = 0.0,
         thresholds: EventThresholds | None = None,
         field_of_view: float = 60.0,
         lane_width: float = 3.5,
@@ -49,8 +46,6 @@ class RoadMonitor:
         self._given = camera
         self._assumed = (field_of_view, lane_width)
         self._still = still
-        self._tracker = VehicleTracker() if track else None
-        self._smoothers = (MaskSmoother(smoothing), MaskSmoother(smoothing))
         self._events = EventDetector(thresholds)
         self._lead = LeadFilter()
         self._size: tuple[int, int] | None = None
@@ -60,15 +55,12 @@ class RoadMonitor:
         self._width: Estimate | None = None
         self._clock = 0.0
 
-    def __call__(self, perception: Perception) -> tuple[Perception, Road]:
+    def __call__(self, perception: Perception) -> Road:
         """Take in the next frame.
 
         Args:
             perception: What the network sees. A frame of a video should have its timestamp; without one, frames are
                 taken to be 1/30 s apart.
-
-        Returns:
-            The perception with identities and smoothed masks where these were asked for, and the road.
 
         Raises:
             ShapeError: If the frame has another shape than the camera.
@@ -76,7 +68,6 @@ class RoadMonitor:
         self._prepare(perception.size)
         timestamp = self._clock if perception.timestamp is None else perception.timestamp
         self._clock = timestamp + 1 / 30
-        perception = self._steady(perception, timestamp)
         lines = [] if perception.lane is None else find_lines(perception.lane)
         drivable = () if perception.drivable is None else _outlines(perception.drivable)
         if self._lines is not None:
@@ -86,18 +77,20 @@ class RoadMonitor:
             lines = assign_positions(lines, [_column_right(line, perception.size) for line in lines])
             if self._calibration is not None:
                 self._calibration.update(lines)
-            return perception, Road(tuple(lines), drivable)
+            return Road(tuple(lines), drivable)
         lines = [dataclasses.replace(line, ground=ground_curve(line, camera)) for line in lines]
         lines = assign_positions(lines, [_metres_right(line) for line in lines])
         if self._calibration is not None:
             self._calibration.update(lines)
-        road = Road(tuple(lines), drivable, camera=camera, calibrated=calibrated)
+        distances = () if perception.boxes is None else find_distances(perception.boxes, camera, errors)
+        road = Road(tuple(lines), drivable, camera=camera, calibrated=calibrated, distances=distances)
         fit = fit_ego_lane(*road.ego_lines, camera, errors, known_width=self._width)
         if fit is not None:
             road = self._with_lane(road, fit, perception, camera, errors, timestamp)
         if not self._still:
-            road = dataclasses.replace(road, events=self._events.update(road, timestamp, perception.frame))
-        return perception, road
+            events = self._events.update(road, timestamp, perception.frame)
+            road = dataclasses.replace(road, events=events, warnings=self._events.warnings)
+        return road
 
     def _prepare(self, size: tuple[int, int]) -> None:
         if size == self._size:
@@ -118,22 +111,10 @@ class RoadMonitor:
                 size, field_of_view=field_of_view, lane_width=lane_width, still=self._still
             )
 
-    def _steady(self, perception: Perception, timestamp: float) -> Perception:
-        """Smooth the masks and track the boxes, where asked for."""
-        if self._smoothers[0].strength > 0:
-            drivable, lane = (
-                None if mask is None else smoother.update(mask)
-                for mask, smoother in zip((perception.drivable, perception.lane), self._smoothers, strict=True)
-            )
-            perception = dataclasses.replace(perception, drivable=drivable, lane=lane)
-        if self._tracker is not None and perception.boxes is not None:
-            perception = dataclasses.replace(perception, boxes=self._tracker.update(perception.boxes, timestamp))
-        return perception
-
-    def _trusted(self, lines: list[LaneLine]) -> tuple[Camera | None, CameraErrors, str | None]:
+    def _trusted(self, lines: list[LaneLine]) -> tuple[Camera | None, CameraErrors, Literal["file", "lanes"] | None]:
         """Return the camera, how well it is known for this frame, and where it is from."""
         if self._camera is not None:
-            camera, errors, origin = self._camera, CameraErrors(), "file"
+            camera, errors = self._camera, CameraErrors()
         else:
             calibration = self._calibration
             assert calibration is not None
@@ -141,14 +122,14 @@ class RoadMonitor:
                 calibration.update(assign_positions(lines, [_column_right(line, calibration.size) for line in lines]))
             if calibration.camera is None:
                 return None, CameraErrors(), None
-            camera, errors, origin = calibration.camera, calibration.errors, "lanes"
+            camera, errors = calibration.camera, calibration.errors
         # Where this frame's lanes surely vanish elsewhere, the car pitches: what rests on the horizon is less sure.
         seen = vanishing_point(lines, camera.size)
         if seen is not None and seen.lines >= 2:
             away = abs(seen.v - camera.vanishing_point()[1])
             if away > 3 * seen.error:
                 errors = dataclasses.replace(errors, pitch=max(errors.pitch, away / camera.fy))
-        return camera, errors, origin
+        return camera, errors, "file" if self._camera is not None else "lanes"
 
     def _with_lane(
         self, road: Road, fit: LaneFit, perception: Perception, camera: Camera, errors: CameraErrors, timestamp: float

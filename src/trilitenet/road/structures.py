@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from trilitenet.processing.geometry import Camera
 
-__all__ = ["EgoLane", "Estimate", "Event", "GroundCurve", "LaneLine", "LeadVehicle", "Road"]
+__all__ = ["EgoLane", "Estimate", "Event", "EventKind", "GroundCurve", "LaneLine", "LeadVehicle", "Road"]
+
+EventKind = Literal["lane_departure_left", "lane_departure_right", "forward_collision"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,7 +169,7 @@ class Event:
     """Something that began or ended. Advisory only: no safety function may rest on it.
 
     Attributes:
-        kind: ``"lane_departure_left"``, ``"lane_departure_right"`` or ``"forward_collision"``.
+        kind: What it is.
         phase: ``"begin"`` or ``"end"``.
         timestamp: Seconds from the start of the video.
         frame: Index of the frame; None without one.
@@ -175,7 +177,7 @@ class Event:
         track_id: The vehicle it is about; -1 where there is none.
     """
 
-    kind: Literal["lane_departure_left", "lane_departure_right", "forward_collision"]
+    kind: EventKind
     phase: Literal["begin", "end"]
     timestamp: float
     frame: int | None
@@ -205,7 +207,9 @@ class Road:
         lead: The vehicle ahead; None without one, or where its distance cannot be trusted.
         camera: The camera that metres rest on; None while there is none to trust.
         calibrated: ``"file"`` = the camera was given, ``"lanes"`` = estimated from the lanes' vanishing point.
+        distances: Metres to each of the perception's boxes, None for one whose distance cannot be told.
         events: What began or ended in this frame.
+        warnings: Kinds of events that are on.
     """
 
     lines: tuple[LaneLine, ...] = ()
@@ -214,7 +218,9 @@ class Road:
     lead: LeadVehicle | None = None
     camera: Camera | None = None
     calibrated: Literal["file", "lanes"] | None = None
+    distances: tuple[Estimate | None, ...] = ()
     events: tuple[Event, ...] = ()
+    warnings: tuple[EventKind, ...] = ()
 
     @property
     def ego_lines(self) -> tuple[LaneLine | None, LaneLine | None]:
@@ -230,6 +236,8 @@ class Road:
             "drivable_polygons": [np.round(outline.astype(np.float64), 1).tolist() for outline in self.drivable],
             "ego_lane": None if self.ego_lane is None else self.ego_lane.to_dict(),
             "lead": None if self.lead is None else self.lead.to_dict(),
+            "distances": [_optional(distance) for distance in self.distances],
             "camera": None if self.camera is None else {"calibrated": self.calibrated, **self.camera.to_dict()},
             "events": [event.to_dict() for event in self.events],
+            "warnings": list(self.warnings),
         }

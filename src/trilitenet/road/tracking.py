@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from trilitenet.errors import ConfigError, import_extra
 from trilitenet.road.structures import LaneLine
-from trilitenet.structures import Boxes
+from trilitenet.structures import Boxes, Perception
 
-__all__ = ["LineTracker", "MaskSmoother", "VehicleTracker", "flicker"]
+__all__ = ["LineTracker", "MaskSmoother", "Steady", "VehicleTracker", "flicker"]
 
 
 class VehicleTracker:
@@ -106,8 +106,9 @@ class LineTracker:
 
 
 class MaskSmoother:
-    """Averages a mask over time, so that its edges flicker less; a moving edge lags by about ``strength`` / (1 -
-    ``strength``) frames.
+    """Averages a mask over time, so that its edges flicker less.
+
+    A moving edge lags by about ``strength`` / (1 - ``strength``) frames.
 
     Args:
         strength: Weight of the past in [0, 1): 0 changes nothing.
@@ -136,6 +137,36 @@ class MaskSmoother:
             return mask
         cv2.accumulateWeighted(current, self._mean, 1.0 - self.strength)
         return np.asarray(self._mean > 0.5)
+
+
+class Steady:
+    """Makes the perceptions of a video hang together: identities for vehicles, masks without flicker.
+
+    Args:
+        track: Give vehicles identities (needs the extra ``track``).
+        smoothing: Weight of the past in the masks, in [0, 1): 0 leaves them alone.
+
+    Raises:
+        ConfigError: If ``smoothing`` is out of range.
+        MissingExtraError: If the extra ``track`` is needed and not installed.
+    """
+
+    def __init__(self, *, track: bool = False, smoothing: float = 0.0) -> None:
+        self._tracker = VehicleTracker() if track else None
+        self._drivable, self._lane = MaskSmoother(smoothing), MaskSmoother(smoothing)
+        self._clock = 0.0
+
+    def __call__(self, perception: Perception) -> Perception:
+        """Return the next frame, steadied. Frames without a timestamp are taken to be 1/30 s apart."""
+        timestamp = self._clock if perception.timestamp is None else perception.timestamp
+        self._clock = timestamp + 1 / 30
+        drivable, lane, boxes = perception.drivable, perception.lane, perception.boxes
+        return dataclasses.replace(
+            perception,
+            drivable=None if drivable is None else self._drivable.update(drivable),
+            lane=None if lane is None else self._lane.update(lane),
+            boxes=boxes if boxes is None or self._tracker is None else self._tracker.update(boxes, timestamp),
+        )
 
 
 def flicker(masks: Iterable[NDArray[np.bool_]]) -> float:

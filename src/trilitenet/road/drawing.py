@@ -1,0 +1,198 @@
+"""The road drawn on the overlay: lane curves, distances, a picture from above, a status bar.
+
+Colours are those of Okabe and Ito (2008), RGB, like the rest of the overlay's.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Collection
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.errors import ShapeError
+from trilitenet.processing.drawing import check_parts, draw_label
+from trilitenet.processing.geometry import Camera
+from trilitenet.road.camera import View
+from trilitenet.road.structures import LaneLine, Road
+from trilitenet.structures import Perception
+
+__all__ = ["ROAD_PARTS", "draw_road"]
+
+Colour = tuple[int, int, int]
+
+ROAD_PARTS: Final = ("lines", "distances", "above", "status")
+"""Parts of the road's drawing that can be left out."""
+
+_EGO: Final[Colour] = (230, 159, 0)
+_OTHER: Final[Colour] = (86, 180, 233)
+_LEAD: Final[Colour] = (213, 94, 0)
+_WARNING: Final[Colour] = (213, 94, 0)
+_INK: Final[Colour] = (235, 235, 235)
+_PLATE: Final[Colour] = (24, 26, 30)
+_SHIFT: Final = 4
+_WORDS: Final = {
+    "lane_departure_left": "LANE DEPARTURE LEFT",
+    "lane_departure_right": "LANE DEPARTURE RIGHT",
+    "forward_collision": "COLLISION AHEAD",
+}
+
+
+def draw_road(
+    canvas: NDArray[np.uint8], perception: Perception, road: Road, *, hide: Collection[str] = ()
+) -> NDArray[np.uint8]:
+    """Draw what a frame tells of the road.
+
+    Args:
+        canvas: (height, width, 3) uint8 RGB, changed in place: the image, or the overlay of masks and boxes.
+        perception: The frame.
+        road: What it tells of the road.
+        hide: Parts to leave out, of `ROAD_PARTS`.
+
+    Returns:
+        The canvas.
+
+    Raises:
+        ShapeError: If the canvas has another size than the frame.
+        ConfigError: If a part is unknown.
+    """
+    hidden = check_parts(hide, ROAD_PARTS)
+    if canvas.shape != (*perception.size, 3) or canvas.dtype != np.uint8:
+        raise ShapeError(f"the canvas must be {(*perception.size, 3)} uint8, got {canvas.shape} {canvas.dtype}")
+    above = None
+    if "above" not in hidden and road.camera is not None:
+        above = _draw_above(canvas, perception, road, road.camera)
+    if "lines" not in hidden:
+        for line in road.lines:
+            _draw_line(canvas, line)
+    if "distances" not in hidden:
+        _draw_distances(canvas, perception, road)
+    if above is not None:
+        margin = max(4, canvas.shape[1] // 100)
+        height, width = above.shape[:2]
+        if height + 2 * margin < canvas.shape[0] and width + 2 * margin < canvas.shape[1]:
+            canvas[margin : margin + height, -margin - width : -margin] = above
+    if "status" not in hidden:
+        _draw_status(canvas, road)
+    return canvas
+
+
+def _fixed(points: NDArray[np.float64]) -> NDArray[np.int32]:
+    return np.round(np.clip(points, -20000, 20000) * (1 << _SHIFT)).astype(np.int32)
+
+
+def _draw_line(canvas: NDArray[np.uint8], line: LaneLine) -> None:
+    ego = abs(line.position) == 1
+    thickness = max(2, round(canvas.shape[1] / (260 if ego else 420)))
+    points = _fixed(line.points.astype(np.float64))
+    cv2.polylines(canvas, [points], False, _PLATE, thickness + 2, cv2.LINE_AA, _SHIFT)
+    cv2.polylines(canvas, [points], False, _EGO if ego else _OTHER, thickness, cv2.LINE_AA, _SHIFT)
+
+
+def _draw_distances(canvas: NDArray[np.uint8], perception: Perception, road: Road) -> None:
+    boxes = perception.boxes
+    if boxes is None:
+        return
+    size = max(9, round(canvas.shape[1] / 80))
+    lead = -1 if road.lead is None else road.lead.box
+    for index, distance in enumerate(road.distances):
+        left, _, right, bottom = (float(v) for v in boxes.xyxy[index])
+        if index == lead and road.lead is not None:
+            corners = [round(v) for v in boxes.xyxy[index].tolist()]
+            cv2.rectangle(canvas, (corners[0], corners[1]), (corners[2], corners[3]), _LEAD, max(2, size // 5))
+            text = f"{road.lead.distance.value:.0f} m"
+            if road.lead.time_to_collision is not None:
+                text += f"  {road.lead.time_to_collision.value:.1f} s"
+            draw_label(canvas, text, (round(left), round(bottom) + size + size // 2), _LEAD, size=size)
+        elif distance is not None and right - left > 2.2 * size:
+            draw_label(canvas, f"{distance.value:.0f} m", (round(left), round(bottom) + size), _OTHER, size=size - 2)
+
+
+def _draw_above(canvas: NDArray[np.uint8], perception: Perception, road: Road, camera: Camera) -> NDArray[np.uint8]:
+    """Return a small picture of the road from above, with lines, vehicles and the own car."""
+    height = max(64, round(canvas.shape[0] * 0.4))
+    far = 48.0
+    view = View(near=0.0, far=far, half_width=11.0, scale=height / far)
+    size = view.size
+    panel = np.asarray(_warp(canvas, camera, view), np.uint8)
+    cv2.convertScaleAbs(panel, dst=panel, alpha=0.5)
+    for line in road.lines:
+        if line.ground is None:
+            continue
+        x = np.linspace(line.ground.start, min(line.ground.end, view.far), 24)
+        pixels = view.to_pixels(np.stack([x, line.ground.at(x)], axis=1))
+        colour = _EGO if abs(line.position) == 1 else _OTHER
+        cv2.polylines(panel, [_fixed(pixels)], False, colour, max(1, height // 120), cv2.LINE_AA, _SHIFT)
+    if perception.boxes is not None:
+        for index, distance in enumerate(road.distances):
+            if distance is None:
+                continue
+            left, _, right, bottom = perception.boxes.xyxy[index].astype(np.float64) - 0.5
+            ground = camera.to_ground(np.array([[(left + right) / 2, bottom]]))
+            lead = road.lead is not None and road.lead.box == index
+            _draw_vehicle(panel, view, float(distance.value), float(ground[0, 1]), _LEAD if lead else _INK)
+    _draw_vehicle(panel, view, -3.0, 0.0, _EGO)
+    cv2.rectangle(panel, (0, 0), (size[1] - 1, size[0] - 1), _INK, 1)
+    return panel
+
+
+def _warp(canvas: NDArray[np.uint8], camera: Camera, view: View) -> NDArray[np.uint8]:
+    matrix = _above_matrix(camera, view)
+    height, width = view.size
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpPerspective(canvas, matrix, (width, height), flags=flags, borderValue=_PLATE), np.uint8)
+
+
+@functools.lru_cache(maxsize=8)
+def _above_matrix(camera: Camera, view: View) -> NDArray[np.float64]:
+    return camera.ground_homography @ view.matrix
+
+
+def _draw_vehicle(panel: NDArray[np.uint8], view: View, rear: float, y: float, colour: Colour) -> None:
+    """Draw a car of 4.5 x 1.8 m whose rear is at (rear, y) metres."""
+    corners = np.array([[rear, y - 0.9], [rear, y + 0.9], [rear + 4.5, y + 0.9], [rear + 4.5, y - 0.9]])
+    cv2.fillPoly(panel, [_fixed(view.to_pixels(corners))], colour, cv2.LINE_AA, _SHIFT)
+
+
+def _draw_status(canvas: NDArray[np.uint8], road: Road) -> None:
+    """Write the figures on a bar at the bottom, and what is being warned of."""
+    height, width = canvas.shape[:2]
+    size = max(9, round(width / 72))
+    bar = 2 * size
+    if bar * 2 > height:
+        return
+    region = canvas[height - bar :]
+    colour = _WARNING if road.warnings else _PLATE
+    cv2.addWeighted(region, 0.25, np.full_like(region, colour), 0.75, 0, dst=region)
+    draw_label(canvas, "   ".join(_figures(road)), (size // 2, height - size // 4), colour, size=size)
+    if road.warnings:
+        text = "  ".join(_WORDS[kind] for kind in road.warnings)
+        draw_label(canvas, text, (round(width * 0.36), round(height * 0.12)), _WARNING, size=2 * size)
+
+
+def _figures(road: Road) -> list[str]:
+    lane = road.ego_lane
+    if lane is None:
+        return ["calibrating" if road.camera is None else "no lane"]
+    figures = []
+    if lane.offset is not None:
+        side = "left" if lane.offset.value >= 0 else "right"
+        figures.append(f"offset {abs(lane.offset.value):.2f} m {side}")
+    if lane.heading is not None:
+        figures.append(f"heading {math.degrees(lane.heading.value):+.1f}°")
+    if lane.curvature is not None:
+        radius = 1 / max(abs(lane.curvature.value), 1e-6)
+        if radius > 3000 or abs(lane.curvature.value) < lane.curvature.error:
+            figures.append("straight")
+        else:
+            bend = "left" if lane.curvature.value > 0 else "right"
+            figures.append(f"radius {radius:.0f} m {bend}")
+    if road.lead is not None:
+        figures.append(f"ahead {road.lead.distance.value:.1f} m")
+        if road.lead.closing_speed is not None:
+            figures.append(f"closing {road.lead.closing_speed.value * 3.6:+.0f} km/h")
+    return figures or ["no lane"]
