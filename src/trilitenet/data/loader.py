@@ -110,6 +110,7 @@ class Loader:
         drop_last: Leave out a last batch that is not full.
         workers: Processes that read ahead; 0 reads in this one.
         pin_memory: Put batches into page-locked memory, for a GPU.
+        share: (index, count): give the index-th of count equal parts of every batch, for one of several processes.
     """
 
     def __init__(
@@ -125,6 +126,7 @@ class Loader:
         drop_last: bool,
         workers: int,
         pin_memory: bool,
+        share: tuple[int, int] = (0, 1),
     ) -> None:
         self.dataset = dataset
         self.batch_size = batch_size
@@ -133,6 +135,7 @@ class Loader:
         self._weights = weights
         self._length = samples_per_epoch or len(dataset)
         self._drop_last = drop_last
+        self._share = share
         self._plan = _Plan()
         more: dict[str, Any] = {"persistent_workers": True, "prefetch_factor": 4} if workers else {}
         self._loader: torch.utils.data.DataLoader[Batch] = torch.utils.data.DataLoader(
@@ -168,7 +171,11 @@ class Loader:
             order = np.arange(self._length, dtype=np.int64)
         draws = [_Draw(epoch, position, int(index)) for position, index in enumerate(order)]
         batches = [draws[first : first + self.batch_size] for first in range(0, len(draws), self.batch_size)]
-        self._plan.batches = batches[start : len(self)]
+        index, count = self._share
+        self._plan.batches = [
+            batch[index * len(batch) // count : (index + 1) * len(batch) // count]
+            for batch in batches[start : len(self)]
+        ]
         return iter(self._loader)
 
 
@@ -184,6 +191,7 @@ def build_loader(
     drop_last: bool | None = None,
     workers: int = 0,
     pin_memory: bool = False,
+    share: tuple[int, int] = (0, 1),
 ) -> Loader:
     """Build a deterministic loader.
 
@@ -199,12 +207,16 @@ def build_loader(
         drop_last: Leave out a last batch that is not full; if left out, when shuffling and another batch is left.
         workers: Processes that read ahead; 0 reads in this one.
         pin_memory: Put batches into page-locked memory, for a GPU.
+        share: (index, count): give the index-th of count equal parts of every batch, for one of several processes;
+            together they see what one process would. ``batch_size`` is that of all together.
 
     Raises:
         ConfigError: If a number is out of range, or the weights do not fit the data set.
     """
     if batch_size < 1 or workers < 0:
         raise ConfigError(f"batch_size must be at least 1 and workers 0, got {batch_size} and {workers}")
+    if not 0 <= share[0] < share[1] or batch_size % share[1]:
+        raise ConfigError(f"a batch of {batch_size} cannot be shared by {share[1]} processes in equal parts")
     if samples_per_epoch is not None and (samples_per_epoch < 1 or not shuffle):
         raise ConfigError("samples_per_epoch must be at least 1, and needs shuffle")
     if weights is None and isinstance(dataset, MixedDataset):
@@ -223,6 +235,7 @@ def build_loader(
         drop_last=(shuffle and (samples_per_epoch or len(dataset)) >= batch_size) if drop_last is None else drop_last,
         workers=workers,
         pin_memory=pin_memory,
+        share=share,
     )
 
 

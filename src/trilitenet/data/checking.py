@@ -1,0 +1,587 @@
+"""What is wrong with a data set, and what is in it: one pass over its files, in parallel.
+
+Every image is decoded (JPEGs at a fraction of their size, which still reads the whole file) and hashed, every mask and
+annotation is read. Of each image only a few hundred bytes are kept, so memory stays small for a hundred thousand.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import csv
+import dataclasses
+import functools
+import hashlib
+import io
+import itertools
+import json
+import math
+import multiprocessing
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from trilitenet.config import DEFAULT_ANCHORS, LONG_SIDE, Anchors
+from trilitenet.data.description import DatasetDescription, MaskMeaning, class_table, read_description
+from trilitenet.data.prepared import is_prepared
+from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, IMAGE_ENDINGS, IMAGE_FOLDER, LANE_FOLDER
+from trilitenet.errors import DataError, import_extra
+
+__all__ = ["KINDS", "CheckReport", "Finding", "check_dataset", "detect_layout"]
+
+KINDS: Final[dict[str, str]] = {
+    "image-unreadable": "the image is empty, truncated or no image",
+    "annotation-unreadable": "the annotation is not JSON, or not in the per-image form",
+    "mask-unreadable": "the mask is empty, truncated or no image",
+    "mask-size": "the mask has another size than its image",
+    "mask-values": "the mask has values that dataset.yaml does not explain",
+    "mask-invisible": "the mask's labels are all at or below the threshold, so they read as background",
+    "box-invalid": "a box with missing, swapped or infinite coordinates, or without area",
+    "box-outside": "a box reaches out of the image",
+    "box-twice": "the same box twice in one image",
+    "category-unknown": "a category that is neither in a class nor one of BDD100K's",
+    "orphan": "an annotation or a mask without its image",
+    "unlabelled": "an image without any label",
+    "name-in-two-splits": "the same name in two splits",
+    "duplicate": "the same file twice in one split",
+    "leak-duplicate": "the same file in two splits",
+    "leak-near-duplicate": "nearly the same picture in two splits",
+    "leak-sequence": "a sequence (index.csv) with images in two splits",
+    "index": "index.csv and the images disagree",
+    "split-missing": "a split that dataset.yaml names and that has no images",
+    "anchors": "too many boxes that no anchor fits",
+}
+"""Everything that is looked for."""
+
+_KNOWN_CATEGORIES: Final = frozenset({
+    "car", "truck", "bus", "train", "person", "pedestrian", "rider", "bike", "bicycle", "motor", "motorcycle",
+    "traffic light", "traffic sign", "vehicle", "trailer", "other vehicle", "other person",
+})  # fmt: skip
+
+_PLAIN_VALUES: Final = frozenset({0, 127, 255})
+"""Values of masks without a description: background, alternative area, foreground."""
+
+_HASH_DISTANCE: Final = 4
+"""Of 64 bits: perceptual hashes this near are compared closer."""
+_THUMB_DISTANCE: Final = 5.0
+"""Mean difference of 16 x 16 grey thumbnails under which two pictures are nearly the same, of 255."""
+_SLACK: Final = 1.0
+"""A box may reach out of the image by this many pixels: annotators round."""
+_MIN_ANCHOR_RECALL: Final = 0.98
+_MIN_BOXES: Final = 50
+"""Anchors are judged by no fewer boxes."""
+
+_MASK_FOLDERS: Final = {"drivable": DRIVABLE_FOLDER, "lane": LANE_FOLDER}
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """One kind of fault.
+
+    Attributes:
+        kind: A key of `KINDS`.
+        split: Where it was found; "" = the whole data set.
+        count: How often.
+        examples: The first few, with the file's path from the root.
+    """
+
+    kind: str
+    split: str
+    count: int
+    examples: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class CheckReport:
+    """What `check_dataset` found.
+
+    Attributes:
+        root: The data set.
+        layout: What it was taken for, in words.
+        images: Split -> images.
+        labelled: Split -> task -> images labelled for it.
+        objects: Split -> category -> boxes (``ignored`` = crowd or an ignored category).
+        conditions: Attribute -> value -> split -> images.
+        sizes: ``"640x360"`` -> images.
+        drivable: Split -> mean part of the image that is drivable, where labelled.
+        lane: Split -> mean part of the image that is lane marking, where labelled.
+        anchor_recall: Part of the boxes that an anchor fits (worst side ratio under 4); NaN without boxes.
+        box_sizes: (width, height) of up to 2,000 boxes, in pixels of an image with a long side of 640.
+        findings: The faults.
+    """
+
+    root: Path
+    layout: str
+    images: dict[str, int]
+    labelled: dict[str, dict[str, int]]
+    objects: dict[str, dict[str, int]]
+    conditions: dict[str, dict[str, dict[str, int]]]
+    sizes: dict[str, int]
+    drivable: dict[str, float]
+    lane: dict[str, float]
+    anchor_recall: float
+    box_sizes: tuple[tuple[float, float], ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing was found."""
+        return not self.findings
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``json.dumps`` takes."""
+        content = dataclasses.asdict(self)
+        content["root"] = str(self.root)
+        content["anchor_recall"] = None if math.isnan(self.anchor_recall) else round(self.anchor_recall, 4)
+        del content["box_sizes"]
+        return {"ok": self.ok, **content}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Facts:
+    """What is kept of one image."""
+
+    name: str
+    size: tuple[int, int] | None
+    digest: bytes
+    hash: int
+    thumb: bytes
+    labelled: tuple[str, ...]
+    objects: dict[str, int]
+    box_sizes: NDArray[np.float32]
+    parts: dict[str, float]
+    attributes: dict[str, str]
+    faults: tuple[tuple[str, str], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Job:
+    root: Path
+    description: DatasetDescription
+    table: dict[str, int]
+
+    def __call__(self, work: tuple[str, str]) -> _Facts:
+        return _look(self, *work)
+
+
+def detect_layout(root: str | Path) -> tuple[str, str]:
+    """Return what a folder looks like.
+
+    Returns:
+        ``published``, ``prepared``, ``bdd100k``, ``coco``, ``yolo``, ``cvat`` or ``unknown``; and why, in words.
+    """
+    root = Path(root)
+    if is_prepared(root):
+        return "prepared", "a prepared data set (prepared.json)"
+    annotated = [folder for folder in (DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER) if (root / folder).is_dir()]
+    if (root / IMAGE_FOLDER).is_dir() and annotated:
+        return "published", f"the published layout ({', '.join([IMAGE_FOLDER, *annotated])})"
+    if (
+        any(root.glob("**/images/100k/*"))
+        or any(root.glob("**/det_20"))
+        or any(root.glob("**/bdd100k_labels_images_*"))
+    ):
+        return "bdd100k", "raw BDD100K (images/100k, labels)"
+    if any(root.glob("annotations/*.json")) or any(root.glob("*/_annotations.coco.json")):
+        return "coco", "COCO (annotations/*.json)"
+    if (root / "data.yaml").is_file():
+        return "yolo", "YOLO (data.yaml)"
+    if any(root.glob("*.xml")):
+        return "cvat", "CVAT (.xml)"
+    return "unknown", "nothing known"
+
+
+def check_dataset(
+    root: str | Path,
+    *,
+    workers: int = 0,
+    anchors: Anchors = DEFAULT_ANCHORS,
+    progress: Callable[[int, int], None] | None = None,
+    examples: int = 5,
+) -> CheckReport:
+    """Look for faults in a data set in the published layout, and count what is in it.
+
+    Args:
+        root: The data set.
+        workers: Processes; 0 works in this one.
+        anchors: That boxes should fit, (width, height) in pixels at a long side of 640.
+        progress: Called with (images done, images in all).
+        examples: Named for each kind of fault.
+
+    Raises:
+        DataError: If it has another layout, or a broken ``dataset.yaml``.
+        MissingExtraError: If ImageHash is not installed.
+    """
+    import_extra("imagehash", "data")
+    root = Path(root)
+    if not root.is_dir():
+        raise DataError(f"{root}: no such folder")
+    layout, words = detect_layout(root)
+    if layout == "prepared":
+        raise DataError(f"{root}: is {words}; check the data set that it was made from")
+    if layout != "published":
+        cure = "" if layout == "unknown" else f"; convert it first: trilitenet data convert {layout} {root} OUT"
+        raise DataError(f"{root}: looks like {words}, not the published layout (images/SPLIT, ...){cure}")
+    description = read_description(root)
+    job = _Job(root, description, class_table(description.class_names, description.classes))
+    names = {
+        folder.name: sorted(
+            path.name for path in folder.iterdir() if path.is_file() and path.suffix.lower() in IMAGE_ENDINGS
+        )
+        for folder in sorted((root / IMAGE_FOLDER).iterdir())
+        if folder.is_dir()
+    }
+    work = [(split, name) for split, items in names.items() for name in items]
+    facts: dict[str, list[_Facts]] = {split: [] for split in names}
+    for done, ((split, _), fact) in enumerate(zip(work, _run(job, work, workers), strict=True), start=1):
+        facts[split].append(fact)
+        if progress:
+            progress(done, len(work))
+    collector = _Collector(examples)
+    for split, items in facts.items():
+        for fact in items:
+            for kind, where in fact.faults:
+                collector.add(kind, split, where)
+    index = _read_index(root)
+    _find_orphans(root, names, collector)
+    _find_names(facts, collector)
+    _find_duplicates(facts, collector)
+    _find_near_duplicates(facts, collector)
+    _find_sequences(index, facts, collector)
+    for split in description.splits:
+        if not names.get(split):
+            collector.add("split-missing", split, f"{IMAGE_FOLDER}/{split}")
+    box_sizes = np.concatenate(
+        [np.zeros((0, 2), np.float32), *(f.box_sizes for items in facts.values() for f in items)]
+    )
+    recall = _anchor_recall(box_sizes, anchors)
+    if len(box_sizes) >= _MIN_BOXES and recall < _MIN_ANCHOR_RECALL:
+        collector.add("anchors", "", f"anchors fit {recall:.1%} of {len(box_sizes)} boxes; train with auto-anchor")
+    chosen = np.random.default_rng(0).permutation(len(box_sizes))[:2000]
+    return CheckReport(
+        root=root,
+        layout=words,
+        images={split: len(items) for split, items in facts.items()},
+        labelled={split: _sorted(Counter(t for f in items for t in f.labelled)) for split, items in facts.items()},
+        objects={split: _sorted(_sum(f.objects for f in items)) for split, items in facts.items()},
+        conditions=_conditions(facts, index),
+        sizes=_sorted(Counter(f"{f.size[1]}x{f.size[0]}" for items in facts.values() for f in items if f.size)),
+        drivable=_means(facts, "drivable"),
+        lane=_means(facts, "lane"),
+        anchor_recall=recall,
+        box_sizes=tuple((float(w), float(h)) for w, h in box_sizes[chosen]),
+        findings=collector.findings(),
+    )
+
+
+class _Collector:
+    """Counts faults and keeps the first examples of each kind and split."""
+
+    def __init__(self, examples: int) -> None:
+        self._limit = examples
+        self._counts: Counter[tuple[str, str]] = Counter()
+        self._examples: dict[tuple[str, str], list[str]] = defaultdict(list)
+
+    def add(self, kind: str, split: str, example: str) -> None:
+        self._counts[kind, split] += 1
+        if len(self._examples[kind, split]) < self._limit:
+            self._examples[kind, split].append(example)
+
+    def findings(self) -> tuple[Finding, ...]:
+        order = {kind: number for number, kind in enumerate(KINDS)}
+        keys = sorted(self._counts, key=lambda key: (order[key[0]], key[1]))
+        return tuple(
+            Finding(kind, split, self._counts[kind, split], tuple(self._examples[kind, split])) for kind, split in keys
+        )
+
+
+def _run(job: _Job, work: list[tuple[str, str]], workers: int) -> Iterator[_Facts]:
+    if workers <= 0 or len(work) < 64:
+        yield from map(job, work)
+        return
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context, initializer=_start) as pool:
+        yield from pool.map(job, work, chunksize=64)
+
+
+def _start() -> None:
+    cv2.setNumThreads(1)
+
+
+def _look(job: _Job, split: str, file: str) -> _Facts:
+    """Read all that belongs to one image."""
+    name = Path(file).stem
+    faults: list[tuple[str, str]] = []
+    path = job.root / IMAGE_FOLDER / split / file
+    size, digest, picture_hash, thumb = _look_at_image(path, f"{IMAGE_FOLDER}/{split}/{file}", faults)
+    labelled: list[str] = []
+    parts: dict[str, float] = {}
+    objects: dict[str, int] = {}
+    box_sizes = np.zeros((0, 2), np.float32)
+    attributes: dict[str, str] = {}
+    document = job.root / DETECTION_FOLDER / split / f"{name}.json"
+    if document.is_file():
+        labelled.append("detection")
+        objects, box_sizes, attributes = _look_at_boxes(job, document, size, faults)
+    for task, folder in _MASK_FOLDERS.items():
+        mask = job.root / folder / split / f"{name}.png"
+        if mask.is_file():
+            labelled.append(task)
+            meaning = job.description.drivable if task == "drivable" else job.description.lane
+            part = _look_at_mask(mask, f"{folder}/{split}/{name}.png", meaning, size, faults)
+            if part is not None:
+                parts[task] = part
+    if not labelled:
+        faults.append(("unlabelled", f"{IMAGE_FOLDER}/{split}/{file}"))
+    return _Facts(
+        name, size, digest, picture_hash, thumb, tuple(labelled), objects, box_sizes, parts, attributes, tuple(faults)
+    )
+
+
+def _look_at_image(
+    path: Path, where: str, faults: list[tuple[str, str]]
+) -> tuple[tuple[int, int] | None, bytes, int, bytes]:
+    """Return (height, width), a digest of the file, a perceptual hash and a 16 x 16 grey thumbnail."""
+    data = path.read_bytes()
+    digest = hashlib.blake2b(data, digest_size=12).digest()
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            width, height = image.size
+            if image.getexif().get(0x0112, 1) in {5, 6, 7, 8}:
+                width, height = height, width
+            # JPEGs are decoded at 1/2, 1/4 or 1/8: a whole file is read, in a part of the time.
+            image.draft("L", (64, 64))
+            grey = image.convert("L").resize((64, 64), Image.Resampling.BILINEAR)
+    except (OSError, SyntaxError, ValueError, EOFError, IndexError, Image.DecompressionBombError) as error:
+        faults.append(("image-unreadable", f"{where} ({_reason(error)})"))
+        return None, digest, 0, b""
+    bits = _perceptual_hash(grey)
+    return (height, width), digest, bits, grey.resize((16, 16), Image.Resampling.BOX).tobytes()
+
+
+def _perceptual_hash(grey: Image.Image) -> int:
+    bits = _phash()(grey).hash.reshape(-1)
+    return int.from_bytes(np.packbits(bits).tobytes(), "big")
+
+
+@functools.cache
+def _phash() -> Callable[[Image.Image], Any]:
+    function: Callable[[Image.Image], Any] = import_extra("imagehash", "data").phash
+    return function
+
+
+def _look_at_boxes(
+    job: _Job, path: Path, size: tuple[int, int] | None, faults: list[tuple[str, str]]
+) -> tuple[dict[str, int], NDArray[np.float32], dict[str, str]]:
+    where = path.relative_to(job.root).as_posix()
+    try:
+        content = json.loads(path.read_bytes())
+        items = [item for frame in content["frames"] for item in (frame.get("objects") or ())]
+        attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
+        labels = [(str(item["category"]), item.get("box2d"), item.get("attributes") or {}) for item in items]
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        faults.append(("annotation-unreadable", f"{where} ({_reason(error)})"))
+        return {}, np.zeros((0, 2), np.float32), {}
+    counts: Counter[str] = Counter()
+    seen: set[tuple[str, float, float, float, float]] = set()
+    sizes: list[tuple[float, float]] = []
+    for number, (category, box, own) in enumerate(labels):
+        if box is None:
+            continue
+        place = f"{where} object {number} ({category})"
+        if category not in job.table and category not in job.description.ignore and category not in _KNOWN_CATEGORIES:
+            faults.append(("category-unknown", place))
+        try:
+            x1, y1, x2, y2 = (float(box[key]) for key in ("x1", "y1", "x2", "y2"))
+        except (KeyError, TypeError, ValueError):
+            faults.append(("box-invalid", place))
+            continue
+        if not (math.isfinite(x1 + y1 + x2 + y2) and x2 > x1 and y2 > y1):
+            faults.append(("box-invalid", f"{place} {x1:g} {y1:g} {x2:g} {y2:g}"))
+            continue
+        if size is not None and (min(x1, y1) < -_SLACK or x2 > size[1] + _SLACK or y2 > size[0] + _SLACK):
+            faults.append(("box-outside", f"{place} {x1:g} {y1:g} {x2:g} {y2:g} in {size[1]}x{size[0]}"))
+        if (category, x1, y1, x2, y2) in seen:
+            faults.append(("box-twice", place))
+        seen.add((category, x1, y1, x2, y2))
+        ignored = bool(own.get("crowd", False)) or category in job.description.ignore
+        counts["ignored" if ignored else category] += 1
+        if size is not None and category in job.table and not ignored:
+            scale = LONG_SIDE / max(size)
+            sizes.append(((x2 - x1) * scale, (y2 - y1) * scale))
+    return dict(counts), np.array(sizes, np.float32).reshape(-1, 2), attributes
+
+
+def _look_at_mask(
+    path: Path, where: str, meaning: MaskMeaning, size: tuple[int, int] | None, faults: list[tuple[str, str]]
+) -> float | None:
+    """Return the part of the mask that is foreground."""
+    try:
+        with Image.open(path) as picture:
+            picture.load()
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+        faults.append(("mask-unreadable", f"{where} ({_reason(error)})"))
+        return None
+    found = (picture.height, picture.width)
+    if size is not None and found != size:
+        faults.append(("mask-size", f"{where} is {found[1]}x{found[0]}, its image {size[1]}x{size[0]}"))
+    counts = np.array(picture.convert("L").histogram())
+    present = set(np.flatnonzero(counts).tolist())
+    allowed = {0, *meaning.values, *meaning.ignore} if meaning.values else {*_PLAIN_VALUES, *meaning.ignore}
+    if present - {0} and max(present) <= meaning.above:
+        faults.append(("mask-invisible", f"{where} has {_listed(present)}; foreground is above {meaning.above}"))
+    elif present - allowed:
+        faults.append(("mask-values", f"{where} has {_listed(present - allowed)}"))
+    levels = np.arange(256)
+    foreground = (levels > meaning.above) & ~np.isin(levels, meaning.ignore)
+    return float(counts[foreground].sum() / counts.sum())
+
+
+def _find_orphans(root: Path, names: dict[str, list[str]], collector: _Collector) -> None:
+    for folder in (DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER):
+        if not (root / folder).is_dir():
+            continue
+        for split in sorted(path.name for path in (root / folder).iterdir() if path.is_dir()):
+            images = {Path(name).stem for name in names.get(split, ())}
+            for path in sorted((root / folder / split).iterdir()):
+                if path.suffix in {".json", ".png"} and path.stem not in images:
+                    collector.add("orphan", split, path.relative_to(root).as_posix())
+
+
+def _find_names(facts: dict[str, list[_Facts]], collector: _Collector) -> None:
+    for one, two in itertools.combinations(facts, 2):
+        for name in sorted({f.name for f in facts[one]} & {f.name for f in facts[two]}):
+            collector.add("name-in-two-splits", f"{one}, {two}", name)
+
+
+def _find_duplicates(facts: dict[str, list[_Facts]], collector: _Collector) -> None:
+    by_digest: dict[bytes, list[tuple[str, str]]] = defaultdict(list)
+    for split, items in facts.items():
+        for fact in items:
+            if fact.size is not None:
+                by_digest[fact.digest].append((split, fact.name))
+    for group in by_digest.values():
+        splits = sorted({split for split, _ in group})
+        for split in splits:
+            names = [name for other, name in group if other == split]
+            for name in names[1:]:
+                collector.add("duplicate", split, f"{names[0]} = {name}")
+        for one, two in itertools.combinations(splits, 2):
+            pair = [next(name for other, name in group if other == split) for split in (one, two)]
+            collector.add("leak-duplicate", f"{one}, {two}", f"{one}/{pair[0]} = {two}/{pair[1]}")
+
+
+def _find_near_duplicates(facts: dict[str, list[_Facts]], collector: _Collector) -> None:
+    readable = {split: [fact for fact in items if fact.thumb] for split, items in facts.items()}
+    for one, two in itertools.combinations(readable, 2):
+        if not readable[one] or not readable[two]:
+            continue
+        small, large = sorted((one, two), key=lambda split: len(readable[split]))
+        hashes = np.array([fact.hash for fact in readable[large]], np.uint64)
+        for fact in readable[small]:
+            near = np.flatnonzero(_popcount(hashes ^ np.uint64(fact.hash)) <= _HASH_DISTANCE)
+            thumb = np.frombuffer(fact.thumb, np.uint8).astype(np.int16)
+            for index in near:
+                other = readable[large][index]
+                if other.digest == fact.digest:
+                    continue
+                gap = np.abs(np.frombuffer(other.thumb, np.uint8) - thumb).mean()
+                # Dark or even pictures are alike in few grey levels: they must be the nearer, the flatter they are.
+                if gap < min(_THUMB_DISTANCE, 0.1 * float(thumb.std()) + 0.2):
+                    collector.add("leak-near-duplicate", f"{one}, {two}", f"{small}/{fact.name} ~ {large}/{other.name}")
+                    break
+
+
+def _popcount(values: NDArray[np.uint64]) -> NDArray[np.uint8]:
+    if hasattr(np, "bitwise_count"):
+        return np.asarray(np.bitwise_count(values), np.uint8)
+    bits = np.unpackbits(values.view(np.uint8).reshape(-1, 8), axis=1)
+    return np.asarray(bits.sum(axis=1), np.uint8)
+
+
+def _read_index(root: Path) -> list[dict[str, str]]:
+    path = root / "index.csv"
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return [{key: value or "" for key, value in row.items() if key} for row in csv.DictReader(file)]
+
+
+def _find_sequences(index: list[dict[str, str]], facts: dict[str, list[_Facts]], collector: _Collector) -> None:
+    if not index:
+        return
+    listed: dict[str, set[str]] = defaultdict(set)
+    splits_of: dict[str, set[str]] = defaultdict(set)
+    for row in index:
+        split, name = row.get("split", ""), row.get("name", "")
+        listed[split].add(name)
+        if row.get("sequence"):
+            splits_of[f"{row.get('source', '')}/{row['sequence']}".lstrip("/")].add(split)
+    for sequence, splits in sorted(splits_of.items()):
+        if len(splits) > 1:
+            collector.add("leak-sequence", ", ".join(sorted(splits)), sequence)
+    for split in sorted({*listed, *facts}):
+        there = {fact.name for fact in facts.get(split, ())}
+        for name in sorted(listed[split] - there):
+            collector.add("index", split, f"{name}: listed, no image")
+        for name in sorted(there - listed[split]):
+            collector.add("index", split, f"{name}: not listed")
+
+
+def _conditions(facts: dict[str, list[_Facts]], index: list[dict[str, str]]) -> dict[str, dict[str, dict[str, int]]]:
+    """Return attribute -> value -> split -> images, for attributes with few values."""
+    rows = {(row.get("split", ""), row.get("name", "")): row for row in index}
+    table: dict[str, dict[str, Counter[str]]] = defaultdict(lambda: defaultdict(Counter))
+    for split, items in facts.items():
+        for fact in items:
+            row = rows.get((split, fact.name), {})
+            for key, value in {**fact.attributes, **row}.items():
+                if key not in {"name", "split"}:
+                    table[key][value][split] += 1
+    total = sum(map(len, facts.values()))
+    limit = max(2, min(40, total // 3))
+    return {
+        key: {value: dict(sorted(counts.items())) for value, counts in sorted(values.items())}
+        for key, values in sorted(table.items())
+        if 1 <= len(values) <= limit and not all(value.replace(".", "", 1).isdigit() for value in values)
+    }
+
+
+def _anchor_recall(sizes: NDArray[np.float32], anchors: Anchors, ratio: float = 4.0) -> float:
+    """Return the part of the boxes whose sides differ from some anchor's by less than ``ratio``."""
+    if not len(sizes):
+        return float("nan")
+    every = np.array([anchor for level in anchors for anchor in level], np.float32)
+    quotient = sizes[:, None] / every
+    worst = np.maximum(quotient, 1 / quotient).max(axis=2).min(axis=1)
+    return float((worst < ratio).mean())
+
+
+def _means(facts: dict[str, list[_Facts]], task: str) -> dict[str, float]:
+    parts = {split: [f.parts[task] for f in items if task in f.parts] for split, items in facts.items()}
+    return {split: round(float(np.mean(values)), 5) for split, values in parts.items() if values}
+
+
+def _sum(counts: Iterable[dict[str, int]]) -> Counter[str]:
+    total: Counter[str] = Counter()
+    for one in counts:
+        total.update(one)
+    return total
+
+
+def _sorted(counts: Counter[str]) -> dict[str, int]:
+    return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
+
+
+def _listed(values: Iterable[int]) -> str:
+    ordered: Sequence[int] = sorted(values)
+    return ", ".join(map(str, ordered[:8])) + (", ..." if len(ordered) > 8 else "")
+
+
+def _reason(error: BaseException) -> str:
+    return (str(error).splitlines() or [""])[0] or type(error).__name__

@@ -1,0 +1,208 @@
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.data.published import write_annotation, write_published
+from trilitenet.data.checking import KINDS, CheckReport, check_dataset, detect_layout
+from trilitenet.errors import DataError
+
+pytest.importorskip("imagehash")
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("clean")
+    write_published(root, "train", 30)
+    write_published(root, "val", 10, seed=1)
+    rows = [
+        f"{split}_{i:04},{split},s{split}{i // 5}"
+        for split, count in (("train", 30), ("val", 10))
+        for i in range(count)
+    ]
+    (root / "index.csv").write_text("name,split,sequence\n" + "\n".join(rows) + "\n")
+    (root / "dataset.yaml").write_text("splits: [train, val]\n")
+    return root
+
+
+@pytest.fixture
+def root(clean: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(clean, tmp_path / "data"))
+
+
+def kinds(report: CheckReport) -> set[str]:
+    return {finding.kind for finding in report.findings}
+
+
+def test_clean_is_clean(clean: Path) -> None:
+    report = check_dataset(clean)
+    assert report.findings == ()
+    assert report.ok
+    assert report.images == {"train": 30, "val": 10}
+    assert report.labelled["train"] == {"detection": 26, "lane": 24, "drivable": 23}
+    assert report.conditions["timeofday"]["night"] == {"train": 13, "val": 5}
+    assert report.sizes == {"128x72": 40}
+    assert 0.3 < report.drivable["train"] < 0.5
+    assert report.layout.startswith("the published layout")
+    assert json.loads(json.dumps(report.to_dict()))["ok"] is True
+
+
+def box(x1: float, y1: float, x2: float, y2: float, category: str = "car") -> dict[str, object]:
+    return {"category": category, "box2d": {"x1": x1, "y1": y1, "x2": x2, "y2": y2}, "attributes": {}}
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def unlink(*paths: Path) -> None:
+    for path in paths:
+        path.unlink()
+
+
+def annotate(root: Path, *items: dict[str, object]) -> None:
+    write_annotation(root, "train", "train_0000", list(items))
+
+
+def draw_mask(root: Path, mask: np.ndarray, name: str = "train_0000") -> None:
+    cv2.imwrite(str(root / f"da_seg_annotations/train/{name}.png"), mask)
+
+
+def add_image(root: Path, split: str, name: str, image: np.ndarray) -> None:
+    """A further image, annotated and listed, so that it has no other fault than the one planted."""
+    cv2.imwrite(str(root / f"images/{split}/{name}.jpg"), image)
+    write_annotation(root, split, name, [])
+    with (root / "index.csv").open("a") as file:
+        file.write(f"{name},{split},own-{split}-{name}\n")
+
+
+def brighter(root: Path) -> np.ndarray:
+    image = cv2.imread(str(root / "images/train/train_0003.jpg"))
+    assert image is not None
+    return np.asarray(np.clip(image.astype(int) + 2, 0, 255), np.uint8)
+
+
+def copy_image(root: Path, split: str, name: str) -> None:
+    shutil.copy(root / "images/train/train_0002.jpg", root / f"images/{split}/{name}.jpg")
+    write_annotation(root, split, name, [])
+    with (root / "index.csv").open("a") as file:
+        file.write(f"{name},{split},own-{split}-{name}\n")
+
+
+FAULTS: dict[str, tuple[str, Callable[[Path], object]]] = {
+    "truncated image": ("image-unreadable", lambda root: truncate(root / "images/train/train_0001.jpg")),
+    "empty image": ("image-unreadable", lambda root: (root / "images/val/val_0001.jpg").write_bytes(b"")),
+    "text as image": ("image-unreadable", lambda root: (root / "images/val/val_0002.jpg").write_text("hello")),
+    "broken annotation": (
+        "annotation-unreadable",
+        lambda root: (root / "det_annotations/train/train_0001.json").write_text('{"frames": ['),
+    ),
+    "truncated mask": ("mask-unreadable", lambda root: truncate(root / "ll_seg_annotations/train/train_0001.png")),
+    "mask of another size": ("mask-size", lambda root: draw_mask(root, np.zeros((36, 64), np.uint8))),
+    "mask values": ("mask-values", lambda root: draw_mask(root, np.full((72, 128), 77, np.uint8))),
+    "mask of ones": ("mask-invisible", lambda root: draw_mask(root, np.ones((72, 128), np.uint8))),
+    "swapped corners": ("box-invalid", lambda root: annotate(root, box(50, 10, 40, 30))),
+    "infinite box": ("box-invalid", lambda root: annotate(root, box(50, 10, float("inf"), 30))),
+    "box outside": ("box-outside", lambda root: annotate(root, box(100, 10, 140, 30))),
+    "box twice": ("box-twice", lambda root: annotate(root, box(10, 10, 40, 30), box(10, 10, 40, 30))),
+    "unknown category": ("category-unknown", lambda root: annotate(root, box(10, 10, 40, 30, "cra"))),
+    "orphan annotation": (
+        "orphan",
+        lambda root: write_annotation(root, "train", "gone", []),
+    ),
+    "orphan mask": ("orphan", lambda root: draw_mask(root, np.zeros((72, 128), np.uint8), "gone")),
+    "no label at all": (
+        "unlabelled",
+        lambda root: unlink(*root.glob("*_annotations/train/train_0000.*")),
+    ),
+    "one name twice": (
+        "name-in-two-splits",
+        lambda root: add_image(root, "val", "train_0000", np.random.default_rng(9).integers(0, 255, (72, 128, 3))),
+    ),
+    "copy in a split": ("duplicate", lambda root: copy_image(root, "train", "copy")),
+    "copy across splits": ("leak-duplicate", lambda root: copy_image(root, "val", "copied")),
+    "near copy across splits": ("leak-near-duplicate", lambda root: add_image(root, "val", "near", brighter(root))),
+    "sequence across splits": (
+        "leak-sequence",
+        lambda root: (root / "index.csv").write_text((root / "index.csv").read_text().replace("sval1", "strain1")),
+    ),
+    "index names no image": ("index", lambda root: (root / "index.csv").open("a").write("nobody,train,x\n")),
+    "no such split": ("split-missing", lambda root: (root / "dataset.yaml").write_text("splits: [train, val, test]\n")),
+    "odd shapes": (
+        "anchors",
+        lambda root: annotate(root, *(box(1, 1 + n / 10, 120, 1.5 + n / 10) for n in range(60))),
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_every_planted_fault_is_found_and_nothing_else(root: Path, fault: str) -> None:
+    kind, plant = FAULTS[fault]
+    plant(root)
+    report = check_dataset(root)
+    assert kinds(report) == {kind}
+    assert report.findings[0].examples
+    assert not report.ok
+
+
+def test_all_kinds_are_planted() -> None:
+    assert {kind for kind, _ in FAULTS.values()} == set(KINDS)
+    assert len(FAULTS) >= 15
+
+
+ONE_PLACE = (
+    "swapped corners", "infinite box", "box outside", "box twice", "unknown category",
+    "mask values", "mask of another size", "no label at all", "one name twice",
+)  # fmt: skip
+"""Faults planted in the same file as another, so that only the last one would be there."""
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_faults_do_not_hide_one_another(root: Path) -> None:
+    planted = {fault: FAULTS[fault] for fault in FAULTS if fault not in ONE_PLACE}
+    assert len(planted) == 15
+    for _, plant in planted.values():
+        plant(root)
+    assert kinds(check_dataset(root)) == {kind for kind, _ in planted.values()}
+
+
+@pytest.mark.slow
+def test_processes_find_the_same(root: Path) -> None:
+    write_published(root, "train", 70)
+    assert check_dataset(root, workers=2) == check_dataset(root)
+
+
+def test_other_layouts_are_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such folder"):
+        check_dataset(tmp_path / "nowhere")
+    for name, layout in (
+        ("images/100k/train", "bdd100k"),
+        ("annotations/instances.json", "coco"),
+        ("data.yaml", "yolo"),
+        ("annotations.xml", "cvat"),
+        ("prepared.json", "prepared"),
+        ("notes.txt", "unknown"),
+    ):
+        folder = tmp_path / layout
+        path = folder / name
+        path.parent.mkdir(parents=True)
+        path.mkdir() if not path.suffix else path.write_text("{}")
+        assert detect_layout(folder)[0] == layout
+        with pytest.raises(DataError, match=r"looks like|prepared data set"):
+            check_dataset(folder)
+
+
+def test_described_values_are_expected(root: Path) -> None:
+    (root / "dataset.yaml").write_text(
+        "drivable: {values: {255: direct, 77: alternative}}\nclasses: {vehicle: [car, cra]}\n"
+    )
+    draw_mask(root, np.full((72, 128), 77, np.uint8))
+    annotate(root, box(10, 10, 40, 30, "cra"))
+    assert check_dataset(root).ok
