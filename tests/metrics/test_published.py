@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import bisect
 import json
 from typing import Any
 
@@ -101,10 +102,13 @@ def independent_average(curve: list[tuple[float, float]]) -> float:
     if not curve:
         return 0.0
     points = [(0.0, 1.0), *curve, (curve[-1][0] + 1e-3, 0.0)]
-    envelope = [max(precision for _, precision in points[index:]) for index in range(len(points))]
+    envelope = [precision for _, precision in points]
+    for index in range(len(points) - 2, -1, -1):
+        envelope[index] = max(envelope[index], envelope[index + 1])
+    recalls = [recall for recall, _ in points]
 
     def height(at: float) -> float:
-        left = max(index for index, (recall, _) in enumerate(points) if recall <= at)
+        left = bisect.bisect_right(recalls, at) - 1
         if left == len(points) - 1:
             return envelope[-1]
         (x0, _), (x1, _) = points[left], points[left + 1]

@@ -11,7 +11,7 @@ from importlib import resources
 __all__ = ["bar_cell", "escape", "histogram_plot", "interval_plot", "line_plot", "page", "percent", "section", "table"]
 
 _WIDTH, _HEIGHT = 360, 260
-_LEFT, _RIGHT, _TOP, _BOTTOM = 38, 10, 10, 36
+_LEFT, _RIGHT, _TOP, _BOTTOM = 50, 10, 10, 36
 
 
 def escape(text: object) -> str:
@@ -41,13 +41,14 @@ def section(title: str, body: str, note: str = "") -> str:
     return f"<section><h2>{escape(title)}</h2>{below}{body}</section>"
 
 
-def bar_cell(value: float | None) -> str:
-    """Return a table cell with a ratio as per cent and as a bar."""
+def bar_cell(value: float | None, note: str = "") -> str:
+    """Return a table cell with a ratio as per cent and as a bar, and a few small words."""
     if value is None or math.isnan(value):
         return '<td class="n">-</td>'
     width = max(0.0, min(1.0, value)) * 100
     bar = f'<span class="track"><span class="bar" style="width:{width:.1f}%"></span></span>'
-    return f'<td class="n">{percent(value)}{bar}</td>'
+    words = f'<span class="note">{escape(note)}</span>' if note else ""
+    return f'<td class="n">{percent(value)}{bar}{words}</td>'
 
 
 def table(head: str, body: str, *, framed: bool = False) -> str:
@@ -77,7 +78,10 @@ def _axes(
     parts.append(f'<path class="axis" d="M{_LEFT} {_TOP}V{base}H{_WIDTH - _RIGHT}"/>')
     middle = (_LEFT + _WIDTH - _RIGHT) / 2
     parts.append(f'<text x="{middle}" y="{_HEIGHT - 5}" text-anchor="middle">{escape(x_label)}</text>')
-    parts.append(f'<text x="{_LEFT + 6}" y="{_TOP + 12}">{escape(y_label)}</text>')
+    high = (_TOP + base) / 2
+    parts.append(
+        f'<text x="9" y="{high}" text-anchor="middle" transform="rotate(-90 9 {high})">{escape(y_label)}</text>'
+    )
     return "".join(parts)
 
 
@@ -106,18 +110,19 @@ def line_plot(
         y: Likewise.
         x_label: Plain text.
         y_label: Plain text.
-        marks: Points with a few words each.
+        marks: At most two points, with a few words each that stand below.
     """
     points = [(a, b) for a, b in zip(x, y, strict=True) if not (math.isnan(a) or math.isnan(b))]
     path = " ".join(f"{_x(a):.1f},{_y(b):.1f}" for a, b in points)
     content = _axes(x_label, y_label, _TENTHS, _TENTHS) + f'<polyline class="curve" points="{path}"/>'
-    for a, b, words in marks:
+    key = []
+    for (a, b, words), name in zip(marks, ("dot", "ring"), strict=False):
         if math.isnan(a) or math.isnan(b):
             continue
-        end, shift = ("end", -7) if a > 0.6 else ("start", 7)
-        content += f'<circle class="dot" cx="{_x(a):.1f}" cy="{_y(b):.1f}" r="4"/>'
-        content += f'<text x="{_x(a) + shift:.1f}" y="{_y(b) - 7:.1f}" text-anchor="{end}">{escape(words)}</text>'
-    return _svg(content, f"{y_label} against {x_label}")
+        content += f'<circle class="{name}" cx="{_x(a):.1f}" cy="{_y(b):.1f}" r="5"/>'
+        key.append(f'<span><i class="{name}"></i>{escape(words)}</span>')
+    words = f'<p class="note key">{"".join(key)}</p>' if key else ""
+    return _svg(content, f"{y_label} against {x_label}") + words
 
 
 def histogram_plot(right: Sequence[int], wrong: Sequence[int], x_label: str) -> str:

@@ -6,15 +6,16 @@ import base64
 
 from trilitenet.config import TASKS
 from trilitenet.engine.figures import CONDITION_FIGURES, HEADLINES, meaning
+from trilitenet.engine.overlays import FALSE, IGNORED, MISSED, RIGHT
 from trilitenet.engine.page import bar_cell, escape, histogram_plot, line_plot, page, percent, section, table
 from trilitenet.engine.report import FEW_IMAGES, Condition, DetectionPlots, Report, WorstFrame
 from trilitenet.metrics.segmentation import SegmentationScores
 
 __all__ = ["report_page"]
 
-_KEY = (
-    '<p class="note key"><i style="background:var(--right)"></i>right<i style="background:var(--false)"></i>false'
-    '<i style="background:var(--missed)"></i>missed<i style="background:#969696"></i>ignored region</p>'
+_COLOURS = (("right", RIGHT), ("false", FALSE), ("missed", MISSED), ("ignored region", IGNORED))
+_KEY = '<p class="note key">{}</p>'.format(
+    "".join(f'<span><i style="background:rgb{colour}"></i>{words}</span>' for words, colour in _COLOURS)
 )
 _PROTOCOLS = {
     "fair": "Native size, one confusion matrix over the data set, COCO matching; ignored regions count neither way.",
@@ -44,18 +45,20 @@ def report_page(report: Report) -> str:
 
 
 def _tiles(report: Report) -> str:
-    tiles = []
-    for key in HEADLINES:
-        figure = report.figures.get(key)
-        if figure is None:
-            continue
-        protocol, task, _ = key.split("/")
-        spread = "" if figure.low is None else f"{percent(figure.low)} to {percent(figure.high)}"
-        tiles.append(
-            f'<div class="tile"><span>{task} ({protocol})</span><b>{percent(figure.value)}</b>'
-            f"<span>{escape(meaning(key).title)}</span><span>{spread}</span></div>"
-        )
-    return f'<div class="tiles">{"".join(tiles)}</div>'
+    groups = []
+    for protocol in report.protocols:
+        tiles = []
+        for key in HEADLINES:
+            figure = report.figures.get(key)
+            if figure is None or not key.startswith(f"{protocol}/"):
+                continue
+            spread = "" if figure.low is None else f"{percent(figure.low)} to {percent(figure.high)}"
+            tiles.append(
+                f'<div class="tile"><span>{key.split("/")[1]}</span><b>{percent(figure.value)}</b>'
+                f"<span>{escape(meaning(key).title)}</span><span>{spread}</span></div>"
+            )
+        groups.append(f'<h3>{protocol} protocol</h3><div class="tiles">{"".join(tiles)}</div>')
+    return "".join(groups)
 
 
 def _figures(report: Report, protocol: str) -> str:
@@ -65,14 +68,16 @@ def _figures(report: Report, protocol: str) -> str:
         owner, task, _ = key.split("/")
         if owner != protocol:
             continue
+        if task != last:
+            rows.append(f'<tr><th colspan="2" class="group">{task}</th></tr>')
+            last = task
         words = meaning(key)
         spread = "" if figure.low is None else f"{percent(figure.low)} to {percent(figure.high)}"
         rows.append(
-            f"<tr><td>{task if task != last else ''}</td><td>{escape(words.title)}</td>{bar_cell(figure.value)}"
-            f'<td class="n">{spread}</td><td class="f">{escape(words.formula)}</td></tr>'
+            f'<tr><td>{escape(words.title)}<span class="note">{escape(words.formula)}</span></td>'
+            f"{bar_cell(figure.value, spread)}</tr>"
         )
-        last = task
-    head = '<th>task</th><th>figure</th><th class="n">per cent</th><th class="n">95% interval</th><th>formula</th>'
+    head = '<th>figure</th><th class="n">per cent, 95% interval</th>'
     body = f'<div class="card">{table(head, "".join(rows))}</div>'
     return section(f"Figures, {protocol} protocol", body, _PROTOCOLS[protocol])
 
@@ -91,8 +96,8 @@ def _detection(report: Report, plots: DetectionPlots) -> str:
         (
             "Confidence of right and wrong boxes",
             histogram_plot(plots.right, plots.wrong, "confidence")
-            + '<p class="note key"><i style="background:var(--right)"></i>right'
-            '<i style="background:var(--false)"></i>wrong (logarithmic scale)</p>',
+            + '<p class="note key"><span><i style="background:var(--right)"></i>right</span>'
+            '<span><i style="background:var(--false)"></i>wrong</span><span>logarithmic scale</span></p>',
         ),
         ("Confusion at the stated confidence", _confusion(plots)),
     ]
@@ -164,7 +169,7 @@ def _conditions(report: Report, protocol: str) -> str:
         cards.append(f'<div class="card">{full}</div>')
     return section(
         f"By condition, {protocol} protocol",
-        f'<div class="grid">{"".join(cards)}</div>',
+        f'<div class="stack">{"".join(cards)}</div>',
         f"Per cent. Grey: under {FEW_IMAGES} images, too few to say much.",
     )
 
