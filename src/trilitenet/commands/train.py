@@ -6,33 +6,45 @@ import dataclasses
 import inspect
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, get_type_hints
 
 import cyclopts
+import numpy as np
 import torch
 import yaml
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from trilitenet.config import ModelCard
+from trilitenet.config import DEFAULT_ANCHORS, ModelCard
 from trilitenet.data.loader import build_loader
-from trilitenet.data.reading import DrivingDataset, sampling_weights
+from trilitenet.data.reading import DrivingDataset, MixedDataset, SampleSource, sampling_weights
+from trilitenet.data.sample import Sample
 from trilitenet.data.transforms import TrainTransform
+from trilitenet.engine.anchors import box_sizes, fit_anchors
 from trilitenet.engine.evaluate import evaluate
+from trilitenet.engine.loggers import build_loggers
 from trilitenet.engine.recipe import TrainConfig, merge, read_recipe
+from trilitenet.engine.results import write_results
 from trilitenet.engine.runtime import make_fabric
 from trilitenet.engine.train import CHECKPOINT_NAME, Trainer, TrainResult
+from trilitenet.engine.transfer import freeze, initialise
 from trilitenet.errors import ConfigError, OutputError
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.torch_backend import TorchBackend
 from trilitenet.losses.detection import DetectionLoss
+from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.losses.multitask import MultiTaskLoss
 from trilitenet.losses.segmentation import SegmentationLoss
 from trilitenet.models.trilitenet import TriLiteNet, build_network
+from trilitenet.models.weights import load_network
+from trilitenet.structures import Boxes, Perception
 
 __all__ = ["build_loss", "train"]
 
-_YAML_FLAGS: Final = ("anchors", "sampling")
+_YAML_FLAGS: Final = ("anchors", "sampling", "extra_data")
 """Fields whose flag takes YAML, for example --sampling '{timeofday: {night: 2}}'."""
 
 
@@ -57,51 +69,108 @@ def train(
     checkpoint = folder / CHECKPOINT_NAME
     if checkpoint.exists() and not (resume or overwrite):
         raise OutputError(f"{folder}: holds a run already; --resume it, --overwrite it, or give another --output")
-    fabric = make_fabric(config.device, config.precision)
+    fabric = make_fabric(config.device, config.precision, devices=config.devices, num_nodes=config.num_nodes)
     torch.manual_seed(config.seed)
+    with _Display(quiet=not fabric.is_global_zero) as display:
+        dataset = _training_data(config)
+        loader = build_loader(
+            dataset,
+            TrainTransform(config.input_size, config.augmentation),
+            batch_size=config.batch_size // config.accumulate,
+            seed=config.seed,
+            weights=sampling_weights(dataset, config.sampling) if config.sampling else None,
+            samples_per_epoch=config.samples_per_epoch,
+            workers=config.workers,
+            pin_memory=fabric.device.type == "cuda",
+            share=(fabric.global_rank, fabric.world_size),
+        )
+        network = _network(config, dataset, display, resume=resume)
+        network.card = _card(config, network, dataset, recipe)
+        validation = None
+        if config.val_split:
+            validation = DrivingDataset(config.data, config.val_split, class_names=network.card.class_names)
+        device = str(fabric.device)
+        trainer = Trainer(
+            config,
+            network,
+            build_loss(config, network),
+            loader,
+            fabric,
+            network.card,
+            validate=None if validation is None else _validation(validation, device),
+            teacher=_teacher(config, network),
+            display=display,
+        )
+        result = trainer.fit(
+            checkpoint if resume else None,
+            lambda step: build_loggers(config.loggers, folder, config.to_dict(), step),
+        )
+        if fabric.is_global_zero and result.finished and "csv" in config.loggers:
+            predictor = Predictor(TorchBackend(trainer.averaged, device))
+            write_results(
+                folder / "results",
+                folder / "metrics.csv",
+                title=f"TriLiteNet {config.variant}: {folder.name}",
+                facts={**network.card.provenance, "training data": "; ".join(network.card.training_data)}
+                | {name: f"{value:.4f}" for name, value in result.metrics.items()},
+                pictures=[] if validation is None else _pictures(predictor, validation, config.pictures),
+            )
+    return result
 
-    dataset = DrivingDataset(config.data, config.train_split, class_names=config.classes)
-    loader = build_loader(
-        dataset,
-        TrainTransform(config.input_size, config.augmentation),
-        batch_size=config.batch_size,
-        seed=config.seed,
-        weights=sampling_weights(dataset, config.sampling) if config.sampling else None,
-        samples_per_epoch=config.samples_per_epoch,
-        workers=config.workers,
-        pin_memory=fabric.device.type == "cuda",
-    )
-    names = tuple(dataset.class_names)
+
+def _training_data(config: TrainConfig) -> SampleSource:
+    first = DrivingDataset(config.data, config.train_split, class_names=config.classes)
+    if not config.extra_data:
+        return first
+    names = first.class_names
+    more = [
+        (DrivingDataset(root, config.train_split, class_names=names), weight)
+        for root, weight in config.extra_data.items()
+    ]
+    return MixedDataset([(first, 1.0), *more])
+
+
+def _network(config: TrainConfig, dataset: SampleSource, display: _Display, *, resume: bool) -> TriLiteNet:
+    """Build the network: anchors, initial weights, frozen parts."""
+    anchors = config.anchors
+    if config.auto_anchor and anchors is None and "detection" in config.tasks and not resume:
+        fit = fit_anchors(box_sizes(dataset, config.input_size, seed=config.seed), DEFAULT_ANCHORS, seed=config.seed)
+        display.line(fit.summary())
+        anchors = fit.anchors
     network = build_network(
         config.variant,
-        len(names),
+        len(dataset.class_names),
         config.tasks,
         pcaa=config.pcaa,
         litepan=config.litepan,
         spp=config.spp,
-        anchors=config.anchors,
+        anchors=anchors,
     )
-    card = ModelCard(
-        variant=config.variant,
-        class_names=names,
-        tasks=network.tasks,
-        blocks=network.blocks,
+    if config.init is not None and not resume:
+        fitted = network.anchors.clone()
+        display.line(f"{config.init}: {initialise(network, load_network(config.init)).summary()}")
+        if anchors is not None:
+            network.anchors.copy_(fitted)
+    freeze(network, config.freeze)
+    return network
+
+
+def _card(config: TrainConfig, network: TriLiteNet, dataset: SampleSource, recipe: Path | None) -> ModelCard:
+    roots = [config.data, *config.extra_data]
+    provenance = {"recipe": recipe.name if recipe is not None else "defaults", "seed": str(config.seed)}
+    if config.init is not None:
+        provenance["initial weights"] = Path(config.init).name
+    if config.teacher is not None:
+        provenance["teacher"] = Path(config.teacher).name
+    return dataclasses.replace(
+        network.card,
+        class_names=tuple(dataset.class_names),
         input_size=config.input_size,
-        training_data=(f"{Path(config.data).name}/{config.train_split}: {len(dataset)} images",),
-        provenance={"recipe": recipe.name if recipe is not None else "defaults", "seed": str(config.seed)},
+        training_data=(
+            f"{', '.join(Path(root).name for root in roots)} ({config.train_split}): {len(dataset)} images",
+        ),
+        provenance=provenance,
     )
-    network.card = dataclasses.replace(card, anchors=network.card.anchors)
-    trainer = Trainer(
-        config,
-        network,
-        build_loss(config, network),
-        loader,
-        fabric,
-        card,
-        validate=_validation(config, names, str(fabric.device)),
-        report=_report,
-    )
-    return trainer.fit(checkpoint if resume else None)
 
 
 def build_loss(config: TrainConfig, network: TriLiteNet) -> MultiTaskLoss:
@@ -122,12 +191,17 @@ def build_loss(config: TrainConfig, network: TriLiteNet) -> MultiTaskLoss:
     return MultiTaskLoss(detection, *masks, weights=config.task_weights, balancing=config.balancing)
 
 
-def _validation(
-    config: TrainConfig, names: tuple[str, ...], device: str
-) -> Callable[[TriLiteNet], Mapping[str, float]] | None:
-    if not config.val_split:
+def _teacher(config: TrainConfig, network: TriLiteNet) -> tuple[TriLiteNet, DistillationLoss] | None:
+    if config.teacher is None:
         return None
-    dataset = DrivingDataset(config.data, config.val_split, class_names=names)
+    teacher = load_network(config.teacher)
+    if not set(teacher.tasks) & set(network.tasks):
+        raise ConfigError(f"{config.teacher}: the teacher has none of the tasks {', '.join(network.tasks)}")
+    return teacher, DistillationLoss(network.anchors, teacher.anchors, config.distillation)
+
+
+def _validation(dataset: DrivingDataset, device: str) -> Callable[[TriLiteNet], Mapping[str, float]]:
+    """Return a function that scores a network by the evaluation command's own code (the 'fair' protocol)."""
 
     def validate(network: TriLiteNet) -> dict[str, float]:
         predictor = Predictor(TorchBackend(network, device))
@@ -136,14 +210,85 @@ def _validation(
         if scores is None:
             return figures
         if scores.detection is not None:
-            figures |= {"detection/ap50": scores.detection.ap50, "detection/recall": scores.detection.recall_all}
+            figures |= {"detection/recall": scores.detection.recall_all, "detection/ap50": scores.detection.ap50}
         if scores.drivable is not None:
             figures |= {"drivable/miou": scores.drivable.miou}
         if scores.lane is not None:
-            figures |= {"lane/iou": scores.lane.as_labelled.iou, "lane/f1_2px": scores.lane.f1}
+            figures |= {
+                "lane/accuracy": scores.lane.as_labelled.balanced_accuracy,
+                "lane/iou": scores.lane.as_labelled.iou,
+                "lane/f1_2px": scores.lane.f1,
+            }
         return figures
 
     return validate
+
+
+def _pictures(
+    predictor: Predictor, dataset: DrivingDataset, count: int
+) -> Iterator[tuple[str, NDArray[np.uint8], NDArray[np.uint8]]]:
+    """Draw labels and predictions of images spread evenly over a data set."""
+    for index in np.linspace(0, len(dataset) - 1, min(count, len(dataset))).astype(int):
+        sample = dataset[int(index)]
+        labels = _as_perception(sample, tuple(dataset.class_names))
+        yield sample.name, labels.draw(), predictor(sample.image).draw(sample.image)
+
+
+def _as_perception(sample: Sample, class_names: tuple[str, ...]) -> Perception:
+    boxes = None
+    if sample.boxes is not None and sample.class_id is not None:
+        boxes = Boxes(sample.boxes, np.ones(len(sample.boxes), np.float32), sample.class_id)
+    return Perception(
+        size=sample.size,
+        class_names=class_names,
+        boxes=boxes,
+        drivable=None if sample.drivable is None else sample.drivable.astype(np.bool_),
+        lane=None if sample.lane is None else sample.lane.astype(np.bool_),
+        image=sample.image,
+    )
+
+
+class _Display:
+    """A progress bar on a terminal, lines elsewhere; both on standard error."""
+
+    def __init__(self, *, quiet: bool) -> None:
+        self._quiet = quiet
+        self._bar: Progress | None = None
+        if not quiet and sys.stderr.isatty():
+            self._bar = Progress(
+                TextColumn("step"),
+                MofNCompleteColumn(),
+                BarColumn(),
+                TimeElapsedColumn(),
+                TimeRemainingColumn(),
+                TextColumn("{task.description}"),
+                console=Console(stderr=True),
+            )
+            self._task = self._bar.add_task("", total=None)
+
+    def __enter__(self) -> _Display:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def line(self, text: str) -> None:
+        """Show a line that stays."""
+        if self._bar is not None:
+            self._bar.console.print(text, highlight=False, markup=False)
+        elif not self._quiet:
+            sys.stderr.write(text + "\n")
+            sys.stderr.flush()
+
+    def step(self, step: int, steps: int, text: str) -> None:
+        """Show how far the run is."""
+        if self._bar is not None:
+            self._bar.update(self._task, completed=step, total=steps, description=text.partition(": ")[2])
+        else:
+            self.line(text)
 
 
 def _flags(config: type[Any], prefix: str = "") -> list[inspect.Parameter]:
@@ -157,11 +302,14 @@ def _flags(config: type[Any], prefix: str = "") -> list[inspect.Parameter]:
             flags += _flags(type(default), f"{prefix}{field.name}.")
             continue
         text = " ".join(helps.get(field.name, "").split())
-        shown = default if default is not dataclasses.MISSING else ""
+        shown = default if default is not dataclasses.MISSING else "{}"
         kind = hints[field.name] if field.name not in _YAML_FLAGS else str
         name = f"{prefix}{field.name}"
         note = cyclopts.Parameter(
-            name="--" + name.replace("_", "-"), help=f"{text} [default: {shown}]", show_default=False, negative=None
+            name="--" + name.replace("_", "-"),
+            help=f"{text} [default: {shown}]",
+            show_default=False,
+            negative_iterable="",
         )
         flags.append(
             inspect.Parameter(
@@ -174,11 +322,6 @@ def _flags(config: type[Any], prefix: str = "") -> list[inspect.Parameter]:
     return flags
 
 
-def _report(line: str) -> None:
-    sys.stderr.write(line + "\n")
-    sys.stderr.flush()
-
-
 def _nested(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings as a recipe holds them: no None, ``augmentation__flip`` within ``augmentation``, YAML read."""
     settings: dict[str, Any] = {}
@@ -187,9 +330,10 @@ def _nested(fields: Mapping[str, Any]) -> dict[str, Any]:
             continue
         if name in _YAML_FLAGS and isinstance(value, str):
             value = yaml.safe_load(value)
-        for part in reversed(name.split("__")[1:]):
+        first, *inner = name.split("__")
+        for part in reversed(inner):
             value = {part: value}
-        settings = merge(settings, {name.split("__")[0]: value})
+        settings = merge(settings, {first: value})
     return settings
 
 

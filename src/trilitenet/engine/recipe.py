@@ -25,6 +25,7 @@ class TrainConfig:
 
     Attributes:
         data: Root folder of a data set in the published layout.
+        extra_data: Root folders of further data sets to train on, each with the weight its images are drawn by.
         train_split: Split to train on.
         val_split: Split to validate on; empty for none.
         classes: Names of the detection classes; those of the data set if left out.
@@ -38,13 +39,23 @@ class TrainConfig:
         litepan: With LitePAN's two paths.
         spp: With spatial pyramid pooling.
         anchors: (width, height) in input pixels, three a level; the default ones if left out.
-        init: Weight file to start from; what fits by name and shape is taken over.
+        auto_anchor: Fit the anchors to the training boxes by k-means, unless ``anchors`` are given (published code: on,
+            with width and height swapped).
+        init: Weight file to start from (or a shipped name); what fits by name and shape is taken over.
+        freeze: Parts that stay as they are, for example encoder, or encoder.level1.
+        teacher: Weight file of a network to distil from, of any variant, with the same classes.
+        distillation: Weights of distillation's detection, drivable and lane terms.
         epochs: Passes over the data (Section IV-A: 200).
-        batch_size: Images an optimiser step (Section IV-A: 16).
+        batch_size: Images an optimiser step (Section IV-A: 16), over all processes.
+        accumulate: Forward and backward passes an optimiser step; each takes batch_size / accumulate images.
+        multi_scale: Range of a random factor on the input size, a step; none if left out.
         lr: Initial learning rate (Section IV-A: 0.001).
         betas: Of AdamW (Section IV-A: 0.937, 0.999).
-        weight_decay: Of AdamW, for weights of convolutions and matrices alone.
+        weight_decay: Of AdamW.
+        decay_all: Decay biases, normalisation and slopes too, not only weights of convolutions and matrices (published
+            code: on).
         final_lr: The cosine ends at this fraction of ``lr`` (published code: 0.2).
+        cosine_steps: Lower the rate after each step, or after each epoch as the published code does.
         warmup_epochs: Linear warm-up takes this long, or ``warmup_steps`` if that is longer (published code: 3).
         warmup_steps: See ``warmup_epochs`` (published code: 1000).
         clip_gradient: Largest norm of the whole gradient; 0 for no limit (the publication has none).
@@ -60,9 +71,15 @@ class TrainConfig:
         focal: alpha and gamma (Section III-C: 0.25, 2).
         validate_every: Epochs between validations; the last epoch is always validated.
         checkpoint_every: Epochs between checkpoints.
+        patience: Stop after so many validations without a better mean over tasks; 0 = never.
+        loggers: Of csv, tensorboard, mlflow and wandb.
+        log_every: Steps between logged losses.
+        pictures: Validation images in the results page, labels beside predictions.
         seed: Of weights, order and augmentation.
         output: Folder of the run.
         device: auto, cpu, cuda or mps.
+        devices: Processes on this machine, a device each (more than one: distributed data-parallel).
+        num_nodes: Machines, each with ``devices`` processes (start them with torchrun or SLURM).
         precision: 32-true, bf16-mixed or 16-mixed; auto = bf16-mixed where the processor has it.
         compile: Compile the network (slow start, faster steps; needs a C++ compiler on a CPU).
         workers: Processes that read data ahead.
@@ -70,6 +87,7 @@ class TrainConfig:
     """
 
     data: str = ""
+    extra_data: dict[str, float] = dataclasses.field(default_factory=dict)
     train_split: str = "train"
     val_split: str = "val"
     classes: tuple[str, ...] | None = None
@@ -83,13 +101,21 @@ class TrainConfig:
     litepan: bool = True
     spp: bool = True
     anchors: Anchors | None = None
+    auto_anchor: bool = False
     init: str | None = None
+    freeze: tuple[str, ...] = ()
+    teacher: str | None = None
+    distillation: tuple[float, float, float] = (1.0, 1.0, 1.0)
     epochs: int = 200
     batch_size: int = 16
+    accumulate: int = 1
+    multi_scale: tuple[float, float] | None = None
     lr: float = 1e-3
     betas: tuple[float, float] = (0.937, 0.999)
     weight_decay: float = 0.01
+    decay_all: bool = False
     final_lr: float = 0.2
+    cosine_steps: Literal["step", "epoch"] = "step"
     warmup_epochs: float = 3.0
     warmup_steps: int = 1000
     clip_gradient: float = 10.0
@@ -105,9 +131,15 @@ class TrainConfig:
     focal: tuple[float, float] = (0.25, 2.0)
     validate_every: int = 1
     checkpoint_every: int = 1
+    patience: int = 0
+    loggers: tuple[Literal["csv", "tensorboard", "mlflow", "wandb"], ...] = ("csv", "tensorboard")
+    log_every: int = 20
+    pictures: int = 6
     seed: int = 0
     output: str = "runs/train"
     device: str = "auto"
+    devices: int = 1
+    num_nodes: int = 1
     precision: Literal["auto", "32-true", "bf16-mixed", "16-mixed"] = "auto"
     compile: bool = False
     workers: int = 2
@@ -115,12 +147,25 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         get_variant(self.variant)
-        for name in ("epochs", "batch_size", "validate_every", "checkpoint_every"):
+        positive = ("epochs", "batch_size", "accumulate", "validate_every", "checkpoint_every", "log_every")
+        for name in (*positive, "devices", "num_nodes"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("weight_decay", "warmup_epochs", "warmup_steps", "clip_gradient", "workers", "max_steps"):
+        for name in (
+            "weight_decay",
+            "warmup_epochs",
+            "warmup_steps",
+            "clip_gradient",
+            "workers",
+            "max_steps",
+            "patience",
+        ):
             if getattr(self, name) < 0:
                 raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
+        if self.batch_size % self.accumulate:
+            raise ConfigError(f"batch_size {self.batch_size} is not a multiple of accumulate {self.accumulate}")
+        if self.multi_scale is not None and not 0 < self.multi_scale[0] <= self.multi_scale[1]:
+            raise ConfigError(f"multi_scale must be two factors, the lower first, got {self.multi_scale}")
         if not self.lr > 0:
             raise ConfigError(f"lr must be above 0, got {self.lr}")
         if not 0 <= self.ema_decay < 1:

@@ -3,43 +3,46 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import torch
 import yaml
-from torch import Tensor, nn
+from torch import Tensor
 
 from trilitenet.config import ModelCard
 from trilitenet.data.batches import Batch
 from trilitenet.engine.checkpoint import random_state, read_checkpoint, set_random_state, write_checkpoint
 from trilitenet.engine.ema import MovingAverage
+from trilitenet.engine.guard import FiniteGuard
+from trilitenet.engine.loggers import RunLogger
 from trilitenet.engine.optim import Schedule, build_optimiser
 from trilitenet.engine.recipe import TrainConfig
+from trilitenet.engine.rescale import draw_size, rescale
 from trilitenet.engine.runtime import StopRequest
-from trilitenet.errors import TrainingError, WeightsError
+from trilitenet.engine.transfer import keep_frozen
+from trilitenet.errors import WeightsError
+from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.losses.multitask import LossTerms, MultiTaskLoss
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
-from trilitenet.models.weights import save_network
+from trilitenet.models.weights import read_card, save_network
 
-__all__ = ["CHECKPOINT_NAME", "RunLogger", "TrainResult", "Trainer"]
+__all__ = ["CHECKPOINT_NAME", "FIGURES", "TrainResult", "Trainer"]
 
 log = logging.getLogger(__name__)
 
-CHECKPOINT_NAME = "last.ckpt"
+CHECKPOINT_NAME: Final = "last.ckpt"
 """The checkpoint in the run's folder that `--resume` continues from."""
 
-FIGURES = {"detection": "detection/ap50", "drivable": "drivable/miou", "lane": "lane/iou"}
+FIGURES: Final = {"detection": "detection/ap50", "drivable": "drivable/miou", "lane": "lane/iou"}
 """The figure each task is judged by; the mean of these is the overall one."""
 
-MAX_BAD_STEPS = 10
-"""So many steps in a row without a finite loss and gradient end the run."""
-
-SAME_ON_RESUME = ("variant", "classes", "tasks", "pcaa", "litepan", "spp", "batch_size", "balancing")
+SAME_ON_RESUME: Final = ("variant", "tasks", "pcaa", "litepan", "spp", "batch_size", "accumulate", "balancing")
 """Settings that a checkpoint must share with the run that resumes it."""
 
 
@@ -51,14 +54,14 @@ class BatchSource(Protocol):
         """Return the batches of an epoch from batch ``start`` on."""
 
 
-class RunLogger(Protocol):
-    """Takes the figures of a run."""
+class Display(Protocol):
+    """Shows a run to its user."""
 
-    def log(self, values: Mapping[str, float], step: int) -> None:
-        """Take named figures of a step."""
+    def line(self, text: str) -> None:
+        """Show a line that stays."""
 
-    def close(self) -> None:
-        """Write out what is left."""
+    def step(self, step: int, steps: int, text: str) -> None:
+        """Show how far the run is."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +70,7 @@ class TrainResult:
 
     Attributes:
         folder: The run's folder.
-        weights: The final weights (the moving average's), a safetensors file.
+        weights: The final weights (the moving average's), a safetensors file; not written if the run was stopped.
         steps: Optimiser steps done.
         finished: False if it was stopped before its end.
         metrics: Figures of the last validation, by name.
@@ -90,11 +93,11 @@ class TrainResult:
 
     def summary(self) -> str:
         """Return one line a reader understands."""
-        state = "finished" if self.finished else "stopped; go on with --resume"
+        speed = f"after {self.steps} steps at {self.images_per_second:.1f} images/s"
+        if not self.finished:
+            return f"stopped {speed}; {self.folder / CHECKPOINT_NAME} holds its state, go on with --resume"
         figures = ", ".join(f"{name} {value:.4f}" for name, value in self.metrics.items())
-        return f"{state} after {self.steps} steps at {self.images_per_second:.1f} images/s: {self.weights}" + (
-            f" ({figures})" if figures else ""
-        )
+        return f"finished {speed}: {self.weights}" + (f" ({figures})" if figures else "")
 
 
 class Trainer:
@@ -104,12 +107,12 @@ class Trainer:
         config: The run.
         network: What to train.
         loss: With its parameters, if it has any.
-        loader: Training batches of ``batch_size`` images.
+        loader: Training batches, ``batch_size / accumulate`` images each.
         fabric: A launched ``lightning_fabric.Fabric``.
         card: What the weights' file is to say of them.
         validate: Returns figures of a network by name; see `FIGURES` for those that tell what is best.
-        loggers: Take the figures.
-        report: Takes lines for the user.
+        teacher: A network to distil from, and the loss for it.
+        display: Shows the run.
     """
 
     def __init__(
@@ -122,65 +125,88 @@ class Trainer:
         card: ModelCard,
         *,
         validate: Callable[[TriLiteNet], Mapping[str, float]] | None = None,
-        loggers: Sequence[RunLogger] = (),
-        report: Callable[[str], None] = log.info,
+        teacher: tuple[TriLiteNet, DistillationLoss] | None = None,
+        display: Display | None = None,
     ) -> None:
         self.config = config
         self.fabric = fabric
         self.loader = loader
         self.card = card
         self.validate = validate
-        self.loggers = loggers
-        self.report = report
+        self.display = display
         self.folder = Path(config.output)
+        self.loggers: Sequence[RunLogger] = ()
 
-        self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.loss = loss.to(fabric.device)
-        optimiser = build_optimiser([network, loss], lr=config.lr, betas=config.betas, weight_decay=config.weight_decay)
-        self.model, self.optimiser = fabric.setup(self._compiled(self.network), optimiser)
+        self.network = network.to(fabric.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        loss = loss.to(fabric.device)
+        optimiser = build_optimiser(
+            [network, loss],
+            lr=config.lr,
+            betas=config.betas,
+            weight_decay=config.weight_decay,
+            decay_all=config.decay_all,
+        )
+        compiled = torch.compile(self.network) if config.compile else self.network
+        self.model, self.optimiser = fabric.setup(compiled, optimiser)
+        self.loss = fabric.setup_module(loss) if any(True for _ in loss.parameters()) else loss
+        self.plain_loss = loss
+        self.teacher = teacher and tuple(part.to(fabric.device).eval() for part in teacher)
         self.ema = MovingAverage(self.network, config.ema_decay, config.ema_ramp) if config.ema_decay else None
-        steps = config.epochs * len(loader)
+        self.guard = FiniteGuard(self.network, optimiser, 20 if fabric.device.type == "cuda" else 1)
+
+        self.epoch_steps = len(loader) // config.accumulate
+        steps = config.epochs * self.epoch_steps
         self.steps = min(steps, config.max_steps) if config.max_steps else steps
-        warmup = max(round(config.warmup_epochs * len(loader)), config.warmup_steps) if config.warmup_epochs else 0
-        self.schedule = Schedule(steps, min(warmup, steps), config.lr, config.final_lr)
+        warmup = max(round(config.warmup_epochs * self.epoch_steps), config.warmup_steps if config.warmup_epochs else 0)
+        stair = self.epoch_steps if config.cosine_steps == "epoch" else 1
+        self.schedule = Schedule(steps, min(warmup, steps), config.lr, config.final_lr, stair)
 
         self.step = 0
         self.best: dict[str, float] = {}
         self.metrics: dict[str, float] = {}
-        self.bad_steps = 0
+        self.stale = 0
         self.seconds = 0.0
         self.images = 0
 
-    def fit(self, resume: str | Path | None = None) -> TrainResult:
+    def fit(
+        self,
+        resume: str | Path | None = None,
+        build_loggers: Callable[[int], Sequence[RunLogger]] = lambda step: (),
+    ) -> TrainResult:
         """Train to the end, or until SIGINT or SIGTERM asks to stop.
 
         Args:
             resume: A checkpoint to go on from.
+            build_loggers: Returns the loggers of a run that goes on from a step.
 
         Raises:
             TrainingError: If the loss or gradient is not finite ten steps in a row.
             WeightsError: If the checkpoint is damaged or of another run.
         """
-        self.folder.mkdir(parents=True, exist_ok=True)
-        (self.folder / "config.yaml").write_text(yaml.safe_dump(self.config.to_dict(), sort_keys=False))
         if resume is not None:
-            self._resume(resume)
+            self.load(resume)
+        if self.fabric.is_global_zero:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            (self.folder / "config.yaml").write_text(yaml.safe_dump(self.config.to_dict(), sort_keys=False))
+            self.loggers = build_loggers(self.step)
         with StopRequest() as stop:
-            while self.step < self.steps and not stop:
-                epoch, start = divmod(self.step, len(self.loader))
+            while self.step < self.steps and not self._stopped(stop) and not self._stalled():
+                epoch, start = divmod(self.step, self.epoch_steps)
                 self._train_epoch(epoch, start, stop)
-                if stop:
+                if self._stopped(stop):
                     break
                 self._end_epoch(epoch)
-            if stop:
-                self._save()
+            finished = not self._stopped(stop)
+            self.save()
         weights = self.folder / "final.safetensors"
-        if not stop:
-            save_network(self.averaged, weights, self._card())
-        for logger in self.loggers:
-            logger.close()
+        if self.fabric.is_global_zero:
+            if finished:
+                save_network(self.averaged, weights, self._card())
+            for logger in self.loggers:
+                logger.close()
+        self.fabric.barrier()
         speed = self.images / self.seconds if self.seconds else 0.0
-        return TrainResult(self.folder, weights, self.step, not stop, self.metrics, self.best, speed)
+        return TrainResult(self.folder, weights, self.step, finished, self.metrics, self.best, speed)
 
     @property
     def averaged(self) -> TriLiteNet:
@@ -190,73 +216,80 @@ class Trainer:
         return network
 
     def _train_epoch(self, epoch: int, start: int, stop: StopRequest) -> None:
-        """Run the optimiser steps of an epoch, from its batch ``start`` on."""
+        """Run the optimiser steps of an epoch, from its step ``start`` on."""
         self.model.train()
-        sums = torch.zeros(len(LossTerms._fields), device=self.fabric.device)
-        count, mark, since = 0, time.perf_counter(), 0
-        for batch in self.loader.epoch(epoch, start=start):
+        keep_frozen(self.network, self.config.freeze)
+        passes = self.config.accumulate
+        batches = self.loader.epoch(epoch, start=start * passes)
+        sums = torch.zeros(len(LossTerms._fields) + 1, device=self.fabric.device)
+        mark, since = time.perf_counter(), 0
+        while group := list(itertools.islice(batches, passes)):
+            if len(group) < passes:
+                break
             rate = self.schedule.apply(self.optimiser, self.step)
-            terms = self._train_step(batch.to(self.fabric.device, non_blocking=True))
-            if terms is not None:
-                sums += torch.stack([term.detach() for term in terms])
-                count += 1
+            sums += self._train_step(group)
             self.step += 1
-            since += len(batch)
-            if self.step % 20 == 0 or self.step == self.steps:
+            since += sum(len(batch) for batch in group) * self.fabric.world_size
+            if self.step % self.config.log_every == 0 or self.step >= self.steps or stop:
                 elapsed = time.perf_counter() - mark
                 self.seconds, self.images = self.seconds + elapsed, self.images + since
-                self._log_losses(epoch, sums / max(count, 1), rate, since / elapsed)
+                self._log_losses(epoch, sums, rate, since / elapsed)
                 sums.zero_()
-                count, mark, since = 0, time.perf_counter(), 0
-            if stop or self.step >= self.steps:
+                mark, since = time.perf_counter(), 0
+            if self.step >= self.steps or self._stopped(stop):
                 break
+        self.guard.look()
 
-    def _train_step(self, batch: Batch) -> LossTerms | None:
-        """Run one optimiser step; None if it was skipped."""
-        images = batch.images.contiguous(memory_format=torch.channels_last)
-        outputs = self.model(normalise_images(images))
-        terms = self.loss(outputs, batch)
-        self.fabric.backward(terms.total)
-        norm = self._clip()
-        if not math.isfinite(float(terms.total.detach())) or not math.isfinite(float(norm)):
-            self._skip(batch)
-            return None
-        self.bad_steps = 0
-        self.optimiser.step()
+    def _train_step(self, batches: Sequence[Batch]) -> Tensor:
+        """Run one optimiser step; return the loss terms and 1, or zeros if it was left out."""
+        sums = torch.zeros(len(LossTerms._fields) + 1, device=self.fabric.device)
+        for index, batch in enumerate(batches):
+            with self.fabric.no_backward_sync(self.model, enabled=index < len(batches) - 1):
+                terms = self._losses(batch.to(self.fabric.device, non_blocking=True))
+                self.fabric.backward(terms.total / len(batches))
+            sums[:-1] += torch.stack([term.detach() for term in terms]) / len(batches)
+        norm = self.fabric.clip_gradients(
+            self.model, self.optimiser, max_norm=self.config.clip_gradient or math.inf, error_if_nonfinite=False
+        )
+        total = sums[0] if self.fabric.world_size == 1 else self.fabric.all_reduce(sums[0])
+        names = tuple(name for batch in batches for name in batch.names)
+        scaled = self.config.precision == "16-mixed"  # its scaler must see bad steps, and leaves them out itself
+        if self.guard.good(self.step, names, total, norm) or scaled:
+            self.optimiser.step()
+            if self.ema is not None:
+                self.ema.update(self.network)
         self.optimiser.zero_grad()
-        if self.ema is not None:
-            self.ema.update(self.network)
-        return terms  # type: ignore[no-any-return]
+        sums[-1] = 1
+        return torch.where(torch.isfinite(sums[0]) & torch.isfinite(norm), sums, torch.zeros_like(sums))
 
-    def _clip(self) -> Tensor:
-        """Limit the norm of the gradient and return what it was."""
-        parameters = [parameter for parameter in self.network.parameters() if parameter.grad is not None]
-        limit = self.config.clip_gradient or math.inf
-        return nn.utils.clip_grad_norm_(parameters, limit, foreach=True)
-
-    def _skip(self, batch: Batch) -> None:
-        """Leave out a step whose loss or gradient is not finite."""
-        self.optimiser.zero_grad()
-        self.bad_steps += 1
-        names = ", ".join(batch.names)
-        log.warning("step %d skipped: its loss or gradient is not finite (images: %s)", self.step, names)
-        if self.bad_steps >= MAX_BAD_STEPS:
-            raise TrainingError(
-                f"loss or gradient not finite for {MAX_BAD_STEPS} steps in a row, the last being step {self.step} "
-                f"(images: {names}); lower --lr, or train with --precision 32-true"
-            )
+    def _losses(self, batch: Batch) -> LossTerms:
+        """Run the network on a batch."""
+        if self.config.multi_scale is not None:
+            size = (batch.images.shape[2], batch.images.shape[3])
+            batch = rescale(batch, draw_size(size, self.config.multi_scale, self.config.seed, self.step))
+        images = normalise_images(batch.images.contiguous(memory_format=torch.channels_last))
+        outputs = self.model(images)
+        terms: LossTerms = self.loss(outputs, batch)
+        if self.teacher:
+            network, distil = self.teacher
+            with torch.no_grad(), self.fabric.autocast():
+                lesson = network(images)
+            terms = terms._replace(total=terms.total + torch.stack(tuple(distil(outputs, lesson))).sum())
+        return terms
 
     def _end_epoch(self, epoch: int) -> None:
         """Validate, keep the best, save."""
         last = self.step >= self.steps
         if self.validate is not None and (last or (epoch + 1) % self.config.validate_every == 0):
-            self.metrics = dict(self.validate(self.averaged))
-            self._tell({f"val/{name}": value for name, value in self.metrics.items()})
-            figures = ", ".join(f"{name} {value:.4f}" for name, value in self.metrics.items())
-            self.report(f"epoch {epoch + 1}/{self.config.epochs}: {figures}")
-            self._keep_best()
+            if self.fabric.is_global_zero:
+                self.metrics = dict(self.validate(self.averaged))
+                self._tell({f"val/{name}": value for name, value in self.metrics.items()})
+                figures = ", ".join(f"{name} {value:.4f}" for name, value in self.metrics.items())
+                self._show(f"epoch {epoch + 1}/{self.config.epochs}: {figures}")
+                self._keep_best()
+            self.stale = self.fabric.broadcast(self.stale)
         if last or (epoch + 1) % self.config.checkpoint_every == 0:
-            self._save()
+            self.save()
 
     def _keep_best(self) -> None:
         """Save the weights of every task that is better than ever, and of the mean over tasks."""
@@ -264,63 +297,115 @@ class Trainer:
         scores = {task: value for task, value in scores.items() if math.isfinite(value)}
         if scores:
             scores["overall"] = sum(scores.values()) / len(scores)
+        self.stale += 1
         for name, value in scores.items():
             if value > self.best.get(name, -math.inf):
                 self.best[name] = value
-                save_network(self.averaged, self.folder / f"best-{name}.safetensors", self._card())
+                card = self._card()
+                card = dataclasses.replace(card, metrics={**card.metrics, f"best {name}": value})
+                save_network(self.averaged, self._best_path(name), card)
+                self.stale = 0 if name == "overall" else self.stale
 
-    def _log_losses(self, epoch: int, means: Tensor, rate: float, speed: float) -> None:
-        losses = dict(zip(LossTerms._fields, means.tolist(), strict=True))
-        self._tell(
-            {f"train/{name}": value for name, value in losses.items()} | {"lr": rate, "images_per_second": speed}
-        )
+    def _best_path(self, name: str) -> Path:
+        return self.folder / f"best-{name}.safetensors"
+
+    def _stalled(self) -> bool:
+        """Return whether validation has not improved for too long."""
+        stalled = 0 < self.config.patience <= self.stale
+        if stalled:
+            self._show(f"no better for {self.stale} validations: stopping early")
+        return stalled
+
+    def _stopped(self, stop: StopRequest) -> bool:
+        """Return whether any process was asked to stop."""
+        if self.fabric.world_size == 1:
+            return bool(stop)
+        wish = torch.tensor(float(bool(stop)), device=self.fabric.device)
+        return bool(self.fabric.all_reduce(wish, reduce_op="sum") > 0)
+
+    def _log_losses(self, epoch: int, sums: Tensor, rate: float, speed: float) -> None:
+        *means, _ = (sums / sums[-1].clamp(min=1)).tolist()
+        losses = dict(zip(LossTerms._fields, means, strict=True))
+        figures = {f"train/{name}": value for name, value in losses.items()}
+        self._tell(figures | {"lr": rate, "images_per_second": speed})
         parts = " ".join(f"{name} {value:.4f}" for name, value in losses.items())
-        self.report(
-            f"epoch {epoch + 1}/{self.config.epochs} step {self.step}/{self.steps}: {parts} ({speed:.1f} images/s)"
-        )
+        text = f"epoch {epoch + 1}/{self.config.epochs} step {self.step}/{self.steps}: {parts} ({speed:.1f} images/s)"
+        if self.display is not None and self.fabric.is_global_zero:
+            self.display.step(self.step, self.steps, text)
 
     def _tell(self, values: Mapping[str, float]) -> None:
         for logger in self.loggers:
             logger.log(values, self.step)
+
+    def _show(self, text: str) -> None:
+        if self.display is not None and self.fabric.is_global_zero:
+            self.display.line(text)
 
     def _card(self) -> ModelCard:
         provenance = {**self.card.provenance, "steps": str(self.step)}
         metrics = {f"val {name}": value for name, value in self.metrics.items()}
         return dataclasses.replace(self.card, metrics=metrics, provenance=provenance)
 
-    def _save(self) -> None:
+    def save(self) -> None:
+        """Write the checkpoint: all that the run needs to go on as if it had never stopped."""
+        if not self.fabric.is_global_zero:
+            return
         write_checkpoint(
             self.folder / CHECKPOINT_NAME,
             {
                 "config": self.config.to_dict(),
+                "classes": self.network.classes,
                 "step": self.step,
                 "network": self.network.state_dict(),
                 "ema": None if self.ema is None else self.ema.state_dict(),
                 "optimiser": self.optimiser.state_dict(),
-                "loss": self.loss.state_dict(),
+                "loss": self.plain_loss.state_dict(),
+                "scaler": self._scaler_state(),
                 "best": self.best,
                 "metrics": self.metrics,
+                "stale": self.stale,
                 "random": random_state(),
             },
         )
 
-    def _resume(self, path: str | Path) -> None:
+    def load(self, path: str | Path) -> None:
+        """Take over the state of a checkpoint.
+
+        Raises:
+            WeightsError: If it is damaged, or of a run with another network, batch or class count.
+        """
         state = read_checkpoint(path)
         ours, theirs = self.config.to_dict(), state["config"]
-        for name in SAME_ON_RESUME:
-            if ours[name] != theirs.get(name):
+        ours["class count"], theirs["class count"] = self.network.classes, state.get("classes", self.network.classes)
+        for name in (*SAME_ON_RESUME, "class count"):
+            if theirs.get(name, ours[name]) != ours[name]:
                 raise WeightsError(
-                    f"{path}: was trained with {name} {theirs.get(name)!r}, this run has {ours[name]!r}; "
-                    f"set it alike, or start anew with --init"
+                    f"{path}: was trained with {name} {theirs[name]!r}, this run has {ours[name]!r}; "
+                    "set it alike, or start anew with --init"
                 )
         self.network.load_state_dict(state["network"])
+        if self.plain_loss.detection is not None:
+            self.plain_loss.detection.anchors.copy_(self.network.anchors)
         if self.ema is not None and state["ema"] is not None:
             self.ema.load_state_dict(state["ema"])
         self.optimiser.load_state_dict(state["optimiser"])
-        self.loss.load_state_dict(state["loss"])
-        self.step = int(state["step"])
+        self.plain_loss.load_state_dict(state["loss"])
+        if state.get("scaler"):
+            self.fabric._precision.load_state_dict(state["scaler"])
+        self.step, self.stale = int(state["step"]), int(state.get("stale", 0))
         self.best, self.metrics = dict(state["best"]), dict(state["metrics"])
+        self._read_best()
+        self.guard.look()
         set_random_state(state["random"])
 
-    def _compiled(self, network: nn.Module) -> nn.Module:
-        return torch.compile(network) if self.config.compile else network  # type: ignore[return-value]
+    def _read_best(self) -> None:
+        """Learn from files newer than the checkpoint what is to be beaten."""
+        for name in (*self.network.tasks, "overall"):
+            path = self._best_path(name)
+            value = read_card(path).metrics.get(f"best {name}", -math.inf) if path.is_file() else -math.inf
+            if value > self.best.get(name, -math.inf):
+                self.best[name] = value
+
+    def _scaler_state(self) -> dict[str, Any]:
+        state: dict[str, Any] = self.fabric._precision.state_dict()
+        return state

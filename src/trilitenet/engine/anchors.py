@@ -1,0 +1,130 @@
+"""Anchors fitted to a data set by k-means on box width and height, in that order."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.config import STRIDES, Anchors
+from trilitenet.data.reading import SampleSource
+from trilitenet.errors import DataError, import_extra
+from trilitenet.processing.letterbox import Letterbox
+
+__all__ = ["AnchorFit", "best_possible_recall", "box_sizes", "fit_anchors"]
+
+PER_LEVEL = 3
+"""Anchors a level."""
+
+
+@dataclasses.dataclass(frozen=True)
+class AnchorFit:
+    """Anchors and how well they suit the boxes they were fitted to.
+
+    Attributes:
+        anchors: (width, height) in input pixels, three a level, small to large; the old ones if those were no worse.
+        changed: Whether they are new.
+        boxes: Number of boxes.
+        recall_before: Share of boxes that some old anchor takes, in [0, 1].
+        recall_after: The same of ``anchors``.
+        fit_before: Mean over boxes of the best anchor's worst side ratio, in (0, 1]: 1 = the very size.
+        fit_after: The same of ``anchors``.
+    """
+
+    anchors: Anchors
+    changed: bool
+    boxes: int
+    recall_before: float
+    recall_after: float
+    fit_before: float
+    fit_after: float
+
+    def summary(self) -> str:
+        """Return one line."""
+        what = "new anchors" if self.changed else "anchors kept"
+        return (
+            f"{what} ({self.boxes} boxes): best possible recall {self.recall_before:.4f} -> {self.recall_after:.4f}, "
+            f"fit {self.fit_before:.3f} -> {self.fit_after:.3f}"
+        )
+
+
+def box_sizes(
+    dataset: SampleSource, canvas: tuple[int, int], *, limit: int = 5000, seed: int = 0
+) -> NDArray[np.float64]:
+    """Return (N, 2) width and height of the labelled boxes in pixels of the letterboxed input.
+
+    Args:
+        dataset: Where samples come from.
+        canvas: (height, width) of the input.
+        limit: At most so many images are read, drawn at random.
+        seed: Of that draw.
+    """
+    order = np.random.default_rng(seed).permutation(len(dataset))[:limit]
+    sizes = [np.zeros((0, 2))]
+    for index in order:
+        sample = dataset[int(index)]
+        if sample.boxes is not None and len(sample.boxes):
+            resized = Letterbox.fit(sample.size, canvas=canvas).resized
+            scale = np.array([resized[1] / sample.size[1], resized[0] / sample.size[0]])
+            sizes.append((sample.boxes[:, 2:] - sample.boxes[:, :2]) * scale)
+    return np.concatenate(sizes)
+
+
+def _worst_ratio(sizes: NDArray[np.float64], anchors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (N,) the best anchor's worst side ratio, in (0, 1]."""
+    ratio = sizes[:, None] / anchors[None]
+    worst: NDArray[np.float64] = np.minimum(ratio, 1 / ratio).min(axis=2).max(axis=1)
+    return worst
+
+
+def best_possible_recall(sizes: NDArray[np.float64], anchors: NDArray[np.float64], ratio_limit: float = 4.0) -> float:
+    """Return the share of boxes that at least one anchor takes.
+
+    Args:
+        sizes: (N, 2) width and height.
+        anchors: (A, 2) width and height in the same unit.
+        ratio_limit: See `trilitenet.losses.detection.match`.
+    """
+    return float((_worst_ratio(sizes, anchors) > 1 / ratio_limit).mean())
+
+
+def fit_anchors(
+    sizes: NDArray[np.float64], before: Anchors, *, ratio_limit: float = 4.0, min_side: float = 2.0, seed: int = 0
+) -> AnchorFit:
+    """Fit nine anchors by k-means, and keep the old ones where they suit no worse.
+
+    Args:
+        sizes: (N, 2) width and height of boxes in input pixels.
+        before: Anchors to compare with.
+        ratio_limit: See `trilitenet.losses.detection.match`.
+        min_side: Boxes with a side under so many pixels are left out.
+        seed: Of k-means.
+
+    Raises:
+        DataError: If there are too few boxes.
+        MissingExtraError: Without SciPy.
+    """
+    cluster: Any = import_extra("scipy.cluster.vq", "train")
+    count = len(STRIDES) * PER_LEVEL
+    sizes = sizes[(sizes >= min_side).all(axis=1)]
+    if len(np.unique(sizes, axis=0)) < count:
+        raise DataError(f"{len(sizes)} boxes are too few to fit {count} anchors; train with --auto-anchor off")
+    old = np.array(before, np.float64).reshape(-1, 2)
+    # Ratios matter, not differences: clusters are sought in the logarithm of the sizes.
+    centres, _ = cluster.kmeans(np.log(sizes), count, iter=20, seed=np.random.default_rng(seed))
+    if len(centres) < count:  # k-means may lose clusters; quantiles of the area fill the gap
+        extra = sizes[np.argsort(sizes.prod(axis=1))][np.linspace(0, len(sizes) - 1, count - len(centres)).astype(int)]
+        centres = np.concatenate([centres, np.log(extra)])
+    new = np.exp(centres)
+    new = np.round(new[np.argsort(new.prod(axis=1))], 1)
+    scores = [(best_possible_recall(sizes, a, ratio_limit), float(_worst_ratio(sizes, a).mean())) for a in (old, new)]
+    changed = scores[1][1] > scores[0][1] and scores[1][0] >= scores[0][0] - 1e-3
+    chosen = new if changed else old
+    anchors = tuple(
+        tuple((float(width), float(height)) for width, height in level)
+        for level in chosen.reshape(len(STRIDES), PER_LEVEL, 2)
+    )
+    after = scores[1] if changed else scores[0]
+    return AnchorFit(anchors, changed, len(sizes), scores[0][0], after[0], scores[0][1], after[1])

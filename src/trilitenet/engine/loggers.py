@@ -1,0 +1,134 @@
+"""Where the figures of a run go: CSV and TensorBoard at hand, MLflow and Weights & Biases if installed."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from trilitenet.errors import import_extra
+
+__all__ = ["CsvLogger", "MLflowLogger", "RunLogger", "TensorBoardLogger", "WandbLogger", "build_loggers"]
+
+
+class RunLogger(Protocol):
+    """Takes the figures of a run."""
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        """Take named figures of a step."""
+
+    def close(self) -> None:
+        """Write out what is left."""
+
+
+class CsvLogger:
+    """One line a figure: step, name, value. Going on from a step drops what came after it.
+
+    Args:
+        path: The file.
+        step: Step the run goes on from; 0 starts the file anew.
+    """
+
+    def __init__(self, path: Path, step: int = 0) -> None:
+        rows = read_csv(path) if step and path.exists() else []
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = path.open("w", newline="", encoding="utf-8")
+        self._writer = csv.writer(self._file)
+        self._writer.writerow(("step", "name", "value"))
+        self._writer.writerows(row for row in rows if row[0] <= step)
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        """Take named figures of a step."""
+        self._writer.writerows((step, name, repr(float(value))) for name, value in values.items())
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def read_csv(path: Path) -> list[tuple[int, str, float]]:
+    """Return the (step, name, value) rows that `CsvLogger` wrote."""
+    with path.open(newline="", encoding="utf-8") as file:
+        return [(int(row["step"]), row["name"], float(row["value"])) for row in csv.DictReader(file)]
+
+
+class TensorBoardLogger:
+    """Event files for TensorBoard.
+
+    Args:
+        folder: Where they go.
+        step: Step the run goes on from.
+    """
+
+    def __init__(self, folder: Path, step: int = 0) -> None:
+        module: Any = import_extra("torch.utils.tensorboard", "train")
+        self._writer = module.SummaryWriter(str(folder), purge_step=step or None)
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        """Take named figures of a step."""
+        for name, value in values.items():
+            self._writer.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        """Write out what is left."""
+        self._writer.close()
+
+
+class MLflowLogger:
+    """An MLflow run, at the tracking server that MLFLOW_TRACKING_URI names."""
+
+    def __init__(self, name: str, config: Mapping[str, Any]) -> None:
+        self._mlflow: Any = import_extra("mlflow", "mlflow")
+        self._mlflow.start_run(run_name=name)
+        self._mlflow.log_params({key: str(value)[:250] for key, value in config.items()})
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        """Take named figures of a step."""
+        self._mlflow.log_metrics(dict(values), step=step)
+
+    def close(self) -> None:
+        """End the run."""
+        self._mlflow.end_run()
+
+
+class WandbLogger:
+    """A Weights & Biases run; WANDB_MODE=offline keeps it on this machine."""
+
+    def __init__(self, name: str, config: Mapping[str, Any], folder: Path) -> None:
+        wandb: Any = import_extra("wandb", "wandb")
+        self._run = wandb.init(project="trilitenet", name=name, config=dict(config), dir=str(folder))
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        """Take named figures of a step."""
+        self._run.log(dict(values), step=step)
+
+    def close(self) -> None:
+        """End the run."""
+        self._run.finish()
+
+
+def build_loggers(names: Sequence[str], folder: Path, config: Mapping[str, Any], step: int = 0) -> list[RunLogger]:
+    """Build loggers by name.
+
+    Args:
+        names: Of csv, tensorboard, mlflow and wandb.
+        folder: The run's folder.
+        config: The resolved configuration.
+        step: Step the run goes on from.
+
+    Raises:
+        MissingExtraError: If a logger's package is not installed.
+    """
+    loggers: list[RunLogger] = []
+    for name in dict.fromkeys(names):
+        if name == "csv":
+            loggers.append(CsvLogger(folder / "metrics.csv", step))
+        elif name == "tensorboard":
+            loggers.append(TensorBoardLogger(folder / "tensorboard", step))
+        elif name == "mlflow":
+            loggers.append(MLflowLogger(folder.name, config))
+        elif name == "wandb":
+            loggers.append(WandbLogger(folder.name, config, folder))
+    return loggers

@@ -1,0 +1,96 @@
+"""The page at the end of a run: curves of losses, metrics and learning rate, labels beside predictions."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from trilitenet.engine.loggers import read_csv
+from trilitenet.errors import import_extra
+
+__all__ = ["write_results"]
+
+_STYLE: Final = (
+    "body{font:16px/1.5 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem}"
+    "img{max-width:100%}table{border-collapse:collapse}td,th{padding:.2rem .8rem;text-align:left}"
+    "figure{margin:1rem 0}.pair{display:grid;grid-template-columns:1fr 1fr;gap:.5rem}"
+)
+
+
+def write_results(
+    folder: Path,
+    metrics: Path,
+    *,
+    title: str,
+    facts: Mapping[str, str],
+    pictures: Iterable[tuple[str, NDArray[np.uint8], NDArray[np.uint8]]] = (),
+) -> Path:
+    """Write the page.
+
+    Args:
+        folder: Where to; made if it is not there.
+        metrics: What `CsvLogger` wrote.
+        title: Of the page.
+        facts: Lines of the table at its top.
+        pictures: Name, labels drawn and prediction drawn ((H, W, 3) uint8 RGB) of images.
+
+    Returns:
+        The path of ``index.html``.
+
+    Raises:
+        MissingExtraError: Without Matplotlib.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    curves: dict[str, tuple[list[int], list[float]]] = {}
+    for step, name, value in read_csv(metrics):
+        steps, values = curves.setdefault(name, ([], []))
+        steps.append(step)
+        values.append(value)
+    groups = {
+        "losses": [name for name in curves if name.startswith("train/")],
+        "metrics": [name for name in curves if name.startswith("val/")],
+        "learning-rate": [name for name in curves if name == "lr"],
+    }
+    figures = []
+    for group, names in groups.items():
+        if names:
+            _plot(folder / f"{group}.png", {name: curves[name] for name in names}, log=group == "losses")
+            figures.append(f'<figure><img src="{group}.png" alt="{group} by step"></figure>')
+    pairs = []
+    for number, (name, labels, prediction) in enumerate(pictures):
+        for what, image in (("labels", labels), ("prediction", prediction)):
+            Image.fromarray(image).save(folder / f"{what}-{number}.jpg", quality=85)
+        pairs.append(
+            f'<figure><figcaption>{html.escape(name)}: labels, prediction</figcaption><div class="pair">'
+            f'<img src="labels-{number}.jpg" alt="labels"><img src="prediction-{number}.jpg" alt="prediction">'
+            "</div></figure>"
+        )
+    rows = "".join(f"<tr><th>{html.escape(key)}</th><td>{html.escape(value)}</td></tr>" for key, value in facts.items())
+    page = folder / "index.html"
+    page.write_text(
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
+        f"<style>{_STYLE}</style><h1>{html.escape(title)}</h1><table>{rows}</table>{''.join(figures)}"
+        f"{'<h2>Labels and predictions</h2>' if pairs else ''}{''.join(pairs)}</html>\n",
+        encoding="utf-8",
+    )
+    return page
+
+
+def _plot(path: Path, curves: Mapping[str, tuple[list[int], list[float]]], *, log: bool) -> None:
+    module: Any = import_extra("matplotlib.figure", "train")
+    figure = module.Figure(figsize=(10, 5), layout="constrained")
+    axes = figure.add_subplot()
+    for name, (steps, values) in curves.items():
+        axes.plot(steps, values, label=name, marker="o" if len(steps) < 30 else None, markersize=3)
+    if log and all(value > 0 for _, values in curves.values() for value in values):
+        axes.set_yscale("log")
+    axes.set_xlabel("step")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    figure.savefig(path, dpi=100)
