@@ -1,0 +1,116 @@
+"""The container files. What a build would show, this machine cannot; what a linter shows, it can."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import kubernetes_validate
+import promql_parser
+import pytest
+import yaml
+
+from tests.apps.server.conftest import MakeApp
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def _yaml(path: str) -> list[Any]:
+    return list(yaml.safe_load_all((ROOT / path).read_text(encoding="utf-8")))
+
+
+def _program(name: str) -> str:
+    path = shutil.which(name, path=str(Path(sys.executable).parent)) or shutil.which(name)
+    if path is None:
+        pytest.skip(f"{name} is not installed")
+    return path
+
+
+def test_the_dockerfile_has_no_faults() -> None:
+    found = subprocess.run([_program("hadolint"), ROOT / "Dockerfile"], capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stdout
+
+
+def test_the_image_is_slim_not_root_and_watched() -> None:
+    text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    last = text[text.rindex("FROM ") :]
+    assert "ARG PYTHON=3.12-slim" in text
+    assert re.search(r"^USER 10001:10001$", last, re.MULTILINE)
+    assert last.index("USER") < last.index("ENTRYPOINT")
+    assert "HEALTHCHECK" in last
+    assert "/healthz" in last
+
+
+def test_the_containers_of_compose_can_do_little() -> None:
+    (compose,) = _yaml("compose.yaml")
+    assert set(compose["services"]) == {"trilitenet", "prometheus", "grafana"}
+    for service in compose["services"].values():
+        assert service["cap_drop"] == ["ALL"]
+        assert service["security_opt"] == ["no-new-privileges:true"]
+        assert all(port.startswith("127.0.0.1:") for port in service["ports"])
+        for volume in service.get("volumes", []):
+            source = volume.split(":")[0]
+            assert not source.startswith("./") or (ROOT / source).exists()
+    assert compose["services"]["trilitenet"]["read_only"] is True
+
+
+def test_the_kubernetes_manifest_is_valid_and_safe() -> None:
+    resources = {resource["kind"]: resource for resource in _yaml("kubernetes/trilitenet.yaml")}
+    for resource in resources.values():
+        kubernetes_validate.validate(resource, kubernetes_validate.latest_version(), strict=True)
+    pod = resources["Deployment"]["spec"]["template"]["spec"]
+    (container,) = pod["containers"]
+    assert pod["securityContext"]["runAsNonRoot"] is True
+    assert container["securityContext"]["readOnlyRootFilesystem"] is True
+    assert container["readinessProbe"]["httpGet"]["path"] == container["startupProbe"]["httpGet"]["path"] == "/readyz"
+    assert container["livenessProbe"]["httpGet"]["path"] == "/healthz"
+    drain = float(container["args"][container["args"].index("--drain") + 1])
+    assert pod["terminationGracePeriodSeconds"] > drain + 30
+
+
+def _expressions() -> list[str]:
+    dashboard = json.loads((ROOT / "monitoring/grafana/dashboards/trilitenet.json").read_text(encoding="utf-8"))
+    shown = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
+    (alerts,) = _yaml("monitoring/alerts.yml")
+    return shown + [rule["expr"] for group in alerts["groups"] for rule in group["rules"]]
+
+
+def test_dashboard_and_alerts_ask_for_what_the_service_counts(make_app: MakeApp) -> None:
+    metrics = make_app().service.metrics
+    known = {"up"}
+    for family in metrics.registry.collect():
+        suffixes = {
+            "counter": ["_total"],
+            "histogram": ["_bucket", "_sum", "_count"],
+        }.get(family.type, [""])
+        known |= {family.name + suffix for suffix in suffixes}
+    for expression in _expressions():
+        promql_parser.parse(expression)
+        names = set(re.findall(r"\b(?:trilitenet|process)_\w+|\bup\b", expression))
+        assert names, expression
+        assert names <= known, expression
+
+
+def test_the_panels_do_not_overlap() -> None:
+    dashboard = json.loads((ROOT / "monitoring/grafana/dashboards/trilitenet.json").read_text(encoding="utf-8"))
+    taken: set[tuple[int, int]] = set()
+    for panel in dashboard["panels"]:
+        place = panel["gridPos"]
+        cells = {(place["x"] + i, place["y"] + j) for i in range(place["w"]) for j in range(place["h"])}
+        assert not taken & cells, panel["title"]
+        assert max(x for x, _ in cells) < 24
+        taken |= cells
+
+
+def test_prometheus_and_grafana_find_each_other() -> None:
+    (prometheus,) = _yaml("monitoring/prometheus.yml")
+    assert prometheus["scrape_configs"][0]["static_configs"][0]["targets"] == ["trilitenet:8000"]
+    (source,) = _yaml("monitoring/grafana/provisioning/datasources/prometheus.yaml")
+    assert source["datasources"][0]["url"] == "http://prometheus:9090"
+    dashboard = json.loads((ROOT / "monitoring/grafana/dashboards/trilitenet.json").read_text(encoding="utf-8"))
+    assert {panel["datasource"]["uid"] for panel in dashboard["panels"]} == {source["datasources"][0]["uid"]}
