@@ -146,7 +146,9 @@ def blend_masks(canvas: NDArray[np.uint8], masks: dict[str, NDArray[np.bool_]]) 
 
 
 def draw_boxes(canvas: NDArray[np.uint8], boxes: Boxes, class_names: tuple[str, ...], *, labels: bool = True) -> None:
-    """Draw boxes, the surest on top, each with its name and confidence.
+    """Draw boxes, the surest on top.
+
+    A label is the class, if there is more than one, and the confidence, or the track's number where there is one.
 
     Args:
         canvas: (height, width, 3) uint8 RGB, changed in place.
@@ -155,7 +157,7 @@ def draw_boxes(canvas: NDArray[np.uint8], boxes: Boxes, class_names: tuple[str, 
         labels: Write the labels too.
     """
     height, width = canvas.shape[:2]
-    thickness = max(1, round(max(height, width) / 500))
+    thickness = max(1, round(max(height, width) / 400))
     for i in range(len(boxes) - 1, -1, -1):
         track = -1 if boxes.track_id is None else int(boxes.track_id[i])
         class_id = int(boxes.class_id[i])
@@ -163,9 +165,9 @@ def draw_boxes(canvas: NDArray[np.uint8], boxes: Boxes, class_names: tuple[str, 
         left, top, right, bottom = (round(float(value)) for value in boxes.xyxy[i])
         cv2.rectangle(canvas, (left, top), (right, bottom), colour, thickness)
         if labels:
-            name = class_names[class_id]
-            text = f"{name} {boxes.confidence[i]:.2f}" if track < 0 else f"{name} {track}"
-            draw_label(canvas, text, (left, top), colour)
+            words = [class_names[class_id]] if len(class_names) > 1 else []
+            words.append(f"{boxes.confidence[i]:.2f}" if track < 0 else f"#{track}")
+            draw_label(canvas, " ".join(words), (left, top), colour)
 
 
 def draw_label(
@@ -181,7 +183,7 @@ def draw_label(
         size: Height of the letters in pixels; by the canvas if left out.
     """
     height, width = canvas.shape[:2]
-    plate = _plate(text, size or max(10, round(max(height, width) / 64)), colour)
+    plate = _plate(text, size or max(10, round(max(height, width) / 80)), colour)
     plate = plate[:height, :width]
     left = min(max(corner[0], 0), width - plate.shape[1])
     top = corner[1] - plate.shape[0]
