@@ -2,8 +2,10 @@ from __future__ import annotations
 
 import io
 import json
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -251,3 +253,23 @@ def test_other_formats(format: str, folder: Path, tmp_path: Path, predictor: Pre
     report = predict_with(predictor, [folder / "photo.jpg"], tmp_path / "out", format=(format,), overlay=False)
     assert report.exit_code == 0
     assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are sent in another way")
+def test_ctrl_c_on_the_command_line(tmp_path: Path, weights: Path) -> None:
+    source, output = drive(tmp_path / "drive.mp4", frames=600), tmp_path / "out"
+    words = ["predict", str(source), "--output", str(output), "--model", str(weights), "--device", "cpu"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "trilitenet", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        for _ in range(600):
+            if process.poll() is not None or (output / "drive.mp4.part").exists():
+                break
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        printed, complaints = process.communicate(timeout=60)
+    assert process.returncode == 130, complaints
+    assert "interrupted: 1 video of" in printed
+    frames = json.loads((output / "drive.json").read_text())["frames"]
+    assert 0 < len(frames) < 600
+    assert len(list(VideoReader(output / "drive.mp4"))) == len(frames)

@@ -369,6 +369,9 @@ def test_what_a_user_names(tmp_path: Path) -> None:
         f"{tmp_path / 'no.png'}: no such file or folder",
         f"{tmp_path / 'no*.png'}: no file matches",
     ]
+    found, _ = find_sources([folder / "9.png", folder, folder / "9.png", "rtsp://c.local/s", "rtsp://c.local/s"])
+    assert [len(source.paths) for source in found if isinstance(source, Stills)] == [1, 1]
+    assert [type(source) for source in found if not isinstance(source, Stills)] == [VideoReader, StreamReader]
     found, _ = find_sources(["rtsp://camera.local/stream"])
     assert [type(source) for source in found] == [StreamReader]
     (tmp_path / "nothing").mkdir()

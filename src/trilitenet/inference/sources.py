@@ -397,7 +397,7 @@ def find_sources(
         rate: Frames a second of numbered pictures.
 
     Returns:
-        The sources in order, neighbouring pictures together; and what cannot be used.
+        The sources in order, each once, neighbouring pictures together; and what cannot be used.
     """
     sources: list[Stills | FrameReader] = []
     failures: list[Failure] = []
@@ -412,7 +412,8 @@ def find_sources(
         except InputError as error:
             failures.append(Failure(name, str(error)))
 
-    for name in map(str, names):
+    taken: set[Path] = set()
+    for name in dict.fromkeys(map(str, names)):
         if re.match(r"[a-z][a-z0-9+.-]+://", name, re.IGNORECASE):
             add(functools.partial(_open_url, name, clip), name)
         elif name == "-":
@@ -428,6 +429,9 @@ def find_sources(
                 failures.append(Failure(name, str(error)))
                 continue
             for path in paths:
+                if path.absolute() in taken:
+                    continue
+                taken.add(path.absolute())
                 if path.suffix.lower() in VIDEO_SUFFIXES:
                     add(functools.partial(VideoReader, path, clip), str(path))
                 else:

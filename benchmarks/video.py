@@ -1,0 +1,115 @@
+"""How much of pure inference speed a whole video keeps: decode, inference, drawing, JSON and encoding together.
+
+    python benchmarks/video.py VIDEO --model tiny --device cpu
+
+Runs of pure inference and of the pipeline take turns in one process, so that a busy machine slows both; the ratio is
+the median over the rounds. Then each stage alone, in processor time a frame, tells what bounds the pipeline.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+import trilitenet
+from trilitenet.commands.predict import predict_with
+from trilitenet.inference.predictor import Predictor
+from trilitenet.inference.sources import Clip, VideoReader
+from trilitenet.inference.video import VideoWriter
+from trilitenet.processing.drawing import draw
+from trilitenet.structures import Perception
+
+
+def pure_inference(predictor: Predictor, batch: np.ndarray, frames: int) -> float:
+    """Return frames a second of the backend alone, on images that are letterboxed already."""
+    began = time.perf_counter()
+    for _ in range(-(-frames // len(batch))):
+        predictor.backend.run(batch)
+    return -(-frames // len(batch)) * len(batch) / (time.perf_counter() - began)
+
+
+def pipeline(predictor: Predictor, video: Path, frames: int, formats: tuple[str, ...]) -> float:
+    """Return frames a second from file to file."""
+    with tempfile.TemporaryDirectory() as folder:
+        report = predict_with(predictor, [video], Path(folder), clip=Clip(max_frames=frames), format=formats)
+    return report.frames / report.seconds
+
+
+def stages(predictor: Predictor, video: Path, frames: int) -> dict[str, float]:
+    """Return each stage's processor time a frame in milliseconds, run alone."""
+    taken: dict[str, float] = {}
+
+    def measure(name: str, work: Callable[[], object]) -> None:
+        began = time.process_time()
+        work()
+        taken[name] = (time.process_time() - began) / frames * 1e3
+
+    images: list[np.ndarray] = []
+    measure("decode", lambda: images.extend(f.image for f in VideoReader(video, Clip(max_frames=frames))))
+    boxed = []
+    measure("letterbox", lambda: boxed.extend(predictor.preprocess(image) for image in images))
+    raws = []
+    size = predictor.batch_size
+    batches = [np.stack([canvas for canvas, _ in boxed[i : i + size]]) for i in range(0, frames, size)]
+    measure("inference", lambda: raws.extend(predictor.backend.run(batch) for batch in batches))
+    perceptions: list[Perception] = []
+
+    def post() -> None:
+        for number, raw in enumerate(raws):
+            part = slice(number * size, number * size + size)
+            perceptions.extend(predictor.postprocess(raw, [letterbox for _, letterbox in boxed[part]], images[part]))
+
+    measure("post-process", post)
+    measure("draw", lambda: [draw(perception) for perception in perceptions])
+    measure("JSON", lambda: [json.dumps(perception.to_dict()) for perception in perceptions])
+    with tempfile.TemporaryDirectory() as folder:
+
+        def encode() -> None:
+            with VideoWriter(Path(folder) / "out.mp4", 25.0) as writer:
+                for number, image in enumerate(images):
+                    writer.write(image, number / 25)
+
+        measure("encode", encode)
+    return taken
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("video", type=Path)
+    parser.add_argument("--model", default="tiny")
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--backend", default="auto")
+    parser.add_argument("--batch-size", type=int, default=4)
+    parser.add_argument("--frames", type=int, default=200)
+    parser.add_argument("--rounds", type=int, default=3)
+    options = parser.parse_args()
+    predictor = trilitenet.load(
+        options.model, device=options.device, backend=options.backend, batch_size=options.batch_size
+    )
+    first = next(iter(VideoReader(options.video))).image
+    batch = np.stack([predictor.preprocess(first)[0]] * options.batch_size)
+    pure_inference(predictor, batch, 20)
+    rounds = []
+    for _ in range(options.rounds):
+        alone = pure_inference(predictor, batch, options.frames)
+        rounds.append((alone, pipeline(predictor, options.video, options.frames, ("json",))))
+    print(f"machine: {platform.processor() or platform.machine()}, {os.cpu_count()} cores; {predictor.backend.name}")
+    for alone, whole in rounds:
+        print(f"pure inference {alone:7.1f} frames/s   pipeline {whole:7.1f} frames/s   ratio {whole / alone:.2f}")
+    print(f"median ratio {statistics.median(whole / alone for alone, whole in rounds):.2f}")
+    print("processor time a frame, each stage alone:")
+    for name, milliseconds in stages(predictor, options.video, min(100, options.frames)).items():
+        print(f"  {name:12s} {milliseconds:7.2f} ms")
+
+
+if __name__ == "__main__":
+    main()
