@@ -61,12 +61,18 @@ class Command(NamedTuple):
 
 
 COMMANDS: Final[tuple[Command, ...]] = (
+    Command("compare", "compare", "compare"),
+    Command("data check", "data", "check"),
+    Command("data convert", "data", "convert"),
+    Command("data prepare", "data", "prepare"),
+    Command("data show", "data", "show"),
     Command("data synthesize", "synthesize", "synthesize"),
     Command("evaluate", "evaluate", "evaluate"),
     Command("predict", "predict", "predict"),
     Command("score", "score", "score"),
     Command("serve", "command", "serve", package="apps.server"),
     Command("train", "train", "train"),
+    Command("train-table", "train_table", "train_table"),
     Command("weights import", "weights", "import_weights"),
     Command("weights info", "weights", "info"),
 )

@@ -1,0 +1,47 @@
+"""Set reports side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from trilitenet.engine.compare import Comparison, compare_reports
+from trilitenet.engine.report import Report, read_report
+from trilitenet.errors import ConfigError, OutputError
+
+__all__ = ["compare"]
+
+
+def compare(
+    *reports: Path,
+    published: bool = False,
+    output: Path | None = None,
+    overwrite: bool = False,
+    resamples: int = 1000,
+) -> Comparison:
+    """Compare reports with the first of them: which differences are real.
+
+    Args:
+        reports: report.json files of `trilitenet evaluate` or `trilitenet score`, or the folders that hold them.
+        published: Add the rows of the paper's tables, each marked with how it was measured.
+        output: Folder to write comparison.json and comparison.html to.
+        overwrite: Replace a comparison that is there.
+        resamples: Bootstrap draws of the images, the same for every model.
+
+    Returns:
+        The comparison.
+    """
+    if not reports:
+        raise ConfigError("give at least one report.json, or a folder that holds one")
+    if output is not None and not overwrite and (output / "comparison.json").exists():
+        raise OutputError(f"{output}: holds comparison.json already; give another folder or --overwrite")
+    named: dict[str, Report] = {}
+    for path in reports:
+        report = read_report(path / "report.json" if path.is_dir() else path)
+        name = Path(report.provenance.model).name or report.provenance.model
+        if name in named:
+            name = f"{name} ({path})"
+        named[name] = report
+    comparison = compare_reports(named, published=published, resamples=resamples)
+    if output is not None:
+        comparison.save(output)
+    return comparison

@@ -1,0 +1,314 @@
+"""Reports side by side: which differences are real."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from trilitenet.engine.figures import HEADLINES, meaning
+from trilitenet.engine.page import escape, interval_plot, page, percent, section, table
+from trilitenet.engine.published_rows import PUBLISHED_ROWS, PublishedRow
+from trilitenet.engine.report import Report, render
+from trilitenet.errors import ConfigError, OutputError
+from trilitenet.metrics.bootstrap import bootstrap, interval
+
+__all__ = ["COMPARISON_SCHEMA", "Comparison", "Difference", "compare_reports"]
+
+COMPARISON_SCHEMA: Final = 1
+"""Version of the JSON of a comparison."""
+FloatArray = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """A figure of one model less that of the first, on the same images.
+
+    Attributes:
+        model: The name under which the other model stands.
+        figure: Figure key.
+        value: Difference of the figures, in [-1, 1].
+        low: Lower end of its 95% interval from paired resampling.
+        high: Upper end.
+        real: The interval leaves out 0.
+    """
+
+    model: str
+    figure: str
+    value: float
+    low: float
+    high: float
+    real: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """Reports side by side.
+
+    Attributes:
+        names: Of the models; the first is what others are compared with.
+        data: Where each was measured.
+        figures: Name -> figure key -> value.
+        differences: Of every other model to the first; none for those measured on other images.
+        unpaired: Name -> why its differences cannot be told.
+        published: Published rows beside them.
+        resamples: Bootstrap draws.
+    """
+
+    names: tuple[str, ...]
+    data: dict[str, str]
+    figures: dict[str, dict[str, float]]
+    differences: tuple[Difference, ...]
+    unpaired: dict[str, str]
+    published: tuple[PublishedRow, ...]
+    resamples: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``json.dumps`` takes (NaN is null)."""
+
+        def known(value: float) -> float | None:
+            return None if math.isnan(value) else value
+
+        return {
+            "schema": COMPARISON_SCHEMA,
+            "names": list(self.names),
+            "data": self.data,
+            "figures": {name: {key: known(value) for key, value in row.items()} for name, row in self.figures.items()},
+            "differences": [
+                {key: known(value) if isinstance(value, float) else value for key, value in vars(one).items()}
+                for one in self.differences
+            ],
+            "unpaired": self.unpaired,
+            "published": [dataclasses.asdict(row) for row in self.published],
+            "resamples": self.resamples,
+        }
+
+    def save(self, folder: Path) -> None:
+        """Write comparison.json and comparison.html into a folder.
+
+        Raises:
+            OutputError: If they cannot be written.
+        """
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            text = json.dumps(self.to_dict(), ensure_ascii=False, indent=1) + "\n"
+            (folder / "comparison.json").write_text(text, encoding="utf-8")
+            (folder / "comparison.html").write_text(_comparison_page(self), encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot be written ({error.strerror})") from error
+
+    def summary(self) -> str:
+        """Return the comparison as text for a terminal."""
+        parts: list[Table | Text] = [_figure_table(self)]
+        parts.append(
+            Text("* differs from the first: the 95% interval of the paired difference leaves out 0", style="dim")
+        )
+        parts += [Text(f"{name}: {reason}") for name, reason in self.unpaired.items()]
+        if self.published:
+            parts += _published_table(self)
+        return render(parts)
+
+    def difference(self, name: str, key: str) -> Difference | None:
+        """Return the difference of a model in a figure, if it could be told."""
+        return next((one for one in self.differences if one.model == name and one.figure == key), None)
+
+
+def compare_reports(
+    reports: Mapping[str, Report], *, published: bool = False, resamples: int = 1000, seed: int = 0
+) -> Comparison:
+    """Compare reports with the first of them.
+
+    Images are resampled once for all models measured on the same images with the same labels, so that what is hard is
+    hard for each of them; the difference of a figure is real when its 95% interval leaves out 0.
+
+    Args:
+        reports: Name -> report, at least one.
+        published: Put the published rows beside them.
+        resamples: Bootstrap draws.
+        seed: Of the draws.
+
+    Raises:
+        ConfigError: If there is no report.
+    """
+    if not reports:
+        raise ConfigError("at least one report is needed")
+    names = tuple(reports)
+    first = reports[names[0]]
+    base = _spread(first, resamples, seed)
+    differences: list[Difference] = []
+    unpaired: dict[str, str] = {}
+    for name in names[1:]:
+        other = reports[name]
+        reason = _why_unpaired(first, other)
+        if reason:
+            unpaired[name] = reason
+            continue
+        spread = _spread(other, resamples, seed)
+        for key, figure in other.figures.items():
+            if key in first.figures and key in spread and key in base:
+                low, high = interval(spread[key] - base[key])
+                value = figure.value - first.figures[key].value
+                differences.append(Difference(name, key, value, low, high, bool(low > 0 or high < 0)))
+    return Comparison(
+        names=names,
+        data={name: f"{report.provenance.data} {report.provenance.split}" for name, report in reports.items()},
+        figures={
+            name: {key: figure.value for key, figure in report.figures.items()} for name, report in reports.items()
+        },
+        differences=tuple(differences),
+        unpaired=unpaired,
+        published=PUBLISHED_ROWS if published else (),
+        resamples=resamples,
+    )
+
+
+def _spread(report: Report, resamples: int, seed: int) -> dict[str, FloatArray]:
+    """Return figure key -> (resamples,) values; the same seed draws the same images for every report."""
+    return {
+        f"{protocol}/{name}": values
+        for protocol, metrics in report.metrics().items()
+        for name, values in bootstrap(metrics.figures, len(report.names), resamples, seed).items()
+    }
+
+
+def _why_unpaired(first: Report, other: Report) -> str:
+    """Say why two reports cannot be compared image by image; empty if they can."""
+    if first.names != other.names:
+        return f"measured on other images ({len(other.names)}, the first on {len(first.names)}); no paired differences"
+    for part, value in first.provenance.data_sha256.items():
+        if other.provenance.data_sha256.get(part, value) != value:
+            return f"measured with other {part} under the same names; no paired differences"
+    return ""
+
+
+def _keys(comparison: Comparison) -> list[str]:
+    return list(dict.fromkeys(key for row in comparison.figures.values() for key in row))
+
+
+def _figure_table(comparison: Comparison) -> Table:
+    shown = Table(title="figures (per cent)", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+    shown.add_column("figure")
+    for name in comparison.names:
+        shown.add_column(name, justify="right")
+    for key in _keys(comparison):
+        cells = []
+        for name in comparison.names:
+            value = percent(comparison.figures[name].get(key))
+            difference = comparison.difference(name, key)
+            if difference is not None:
+                mark = "*" if difference.real else " "
+                value += f" ({_signed(difference.low)} to {_signed(difference.high)}){mark}"
+            cells.append(value)
+        shown.add_row(_label(key), *cells)
+    return shown
+
+
+def _published_table(comparison: Comparison) -> list[Table | Text]:
+    keys = list(comparison.published[0].figures)
+    shown = Table(
+        title="beside published rows (per cent)", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold"
+    )
+    shown.add_column("model")
+    for key in keys:
+        shown.add_column(_label(key).removeprefix("paper "), justify="right")
+    shown.add_column("measured", no_wrap=True)
+    for name in comparison.names:
+        cells = [percent(comparison.figures[name].get(key)) for key in keys]
+        shown.add_row(name, *cells, f"here, {comparison.data[name]}", style="bold")
+    protocols = list(dict.fromkeys(row.protocol for row in comparison.published))
+    for row in comparison.published:
+        shown.add_row(row.name, *row.printed, f"[{protocols.index(row.protocol) + 1}]".replace("[", r"\["))
+    notes = "\n".join(f"[{number}] {protocol}" for number, protocol in enumerate(protocols, 1))
+    return [shown, Text(notes + "\n[1] and [2]: BDD100K validation split, 10,000 images")]
+
+
+def _label(key: str) -> str:
+    protocol, task, _ = key.split("/")
+    return f"{protocol} {task} {meaning(key).title}"
+
+
+def _signed(value: float) -> str:
+    return "-" if math.isnan(value) else f"{100 * value:+.1f}"
+
+
+def _comparison_page(comparison: Comparison) -> str:
+    names = comparison.names
+    parts = [
+        f"<h1>{escape(' against '.join(names)) if len(names) > 1 else escape(names[0])}</h1>",
+        f'<p class="lead">Differences to {escape(names[0])}, image by image, {comparison.resamples} resamplings. '
+        "Filled: the 95% interval leaves out 0.</p>",
+    ]
+    plots = []
+    for name in names[1:]:
+        rows = [
+            (_label(key), one.value, one.low, one.high, one.real)
+            for key in HEADLINES
+            if (one := comparison.difference(name, key)) is not None
+        ]
+        body = (
+            interval_plot(rows, f"differences of {name} to {names[0]}, points of a per cent")
+            if rows
+            else f'<p class="note">{escape(comparison.unpaired.get(name, "no figure in common"))}</p>'
+        )
+        plots.append(f'<div class="card"><h3>{escape(name)} less {escape(names[0])}, points</h3>{body}</div>')
+    if plots:
+        parts.append(section("Which differences are real", f'<div class="grid">{"".join(plots)}</div>'))
+    parts.append(section("Every figure", f'<div class="card">{_page_figures(comparison)}</div>', "Per cent."))
+    if comparison.published:
+        note = (
+            "Published rows are copied from the tables of the TriLiteNet paper (BDD100K validation, 10,000 images). "
+            "Only figures of the paper protocol on the same images can be set against them."
+        )
+        parts.append(section("Beside published rows", f'<div class="card">{_page_published(comparison)}</div>', note))
+    return page("trilitenet: comparison", "\n".join(parts))
+
+
+def _page_figures(comparison: Comparison) -> str:
+    head = "<th>figure</th>" + "".join(f'<th class="n">{escape(name)}</th>' for name in comparison.names)
+    rows = []
+    for key in _keys(comparison):
+        cells = ""
+        for name in comparison.names:
+            value = percent(comparison.figures[name].get(key))
+            one = comparison.difference(name, key)
+            note = ""
+            if one is not None:
+                value = f"<b>{value}</b>" if one.real else value
+                verdict = "real" if one.real else "may be chance"
+                note = f'<span class="note">{_signed(one.low)} to {_signed(one.high)}, {verdict}</span>'
+            cells += f'<td class="n">{value}{note}</td>'
+        rows.append(f"<tr><td>{escape(_label(key))}</td>{cells}</tr>")
+    return table(head, "".join(rows))
+
+
+def _page_published(comparison: Comparison) -> str:
+    keys = list(comparison.published[0].figures)
+    head = "<th>model</th>" + "".join(
+        f'<th class="n">{escape(_label(key).removeprefix("paper "))}</th>' for key in keys
+    )
+    rows = [
+        f"<tr><td><b>{escape(name)}</b><span class=note>measured here, on {escape(comparison.data[name])}</span></td>"
+        + _cells([comparison.figures[name].get(key) for key in keys])
+        + "</tr>"
+        for name in comparison.names
+    ]
+    rows += [
+        f"<tr><td>{escape(row.name)}<span class=note>{escape(row.source)}; {escape(row.protocol)}</span></td>"
+        + "".join(f'<td class="n">{text}</td>' for text in row.printed)
+        + "</tr>"
+        for row in comparison.published
+    ]
+    return table(head, "".join(rows))
+
+
+def _cells(values: Sequence[float | None]) -> str:
+    return "".join(f'<td class="n">{percent(value)}</td>' for value in values)
