@@ -1,0 +1,488 @@
+"""``trilitenet data``: convert, check, show and prepare data sets."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import cv2
+from cyclopts import Parameter
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from trilitenet.data.check_page import check_page, picture_page
+from trilitenet.data.checking import KINDS, CheckReport, check_dataset, detect_layout
+from trilitenet.data.contact_sheet import contact_sheet, draw_sample, pick
+from trilitenet.data.converting import ConversionOptions, ConversionReport
+from trilitenet.data.converting import convert as run_conversion
+from trilitenet.data.description import DatasetDescription
+from trilitenet.data.prepared import CACHE_FOLDER, is_prepared
+from trilitenet.data.prepared import prepare as run_preparation
+from trilitenet.data.reading import IMAGE_FOLDER, DrivingDataset
+from trilitenet.data.records import RecordSource
+from trilitenet.data.sample import Sample
+from trilitenet.errors import ConfigError, DataError, OutputError
+from trilitenet.formats.readers.bdd100k import read_bdd100k
+from trilitenet.formats.readers.coco import read_coco
+from trilitenet.formats.readers.cvat import read_cvat
+from trilitenet.formats.readers.mapping import LabelMapping, read_mapping
+from trilitenet.formats.readers.masks import read_masks
+from trilitenet.formats.readers.yolo import read_yolo
+from trilitenet.processing.letterbox import Letterbox
+
+__all__ = ["Checked", "Converted", "Prepared", "Shown", "check", "convert", "prepare", "show"]
+
+Progressed = Callable[[int, int], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Converted:
+    """What `convert` did.
+
+    Attributes:
+        output: The data set written.
+        found: What was found in the source.
+        report: Counts of what was written and what was left out.
+    """
+
+    output: Path
+    found: tuple[str, ...]
+    report: ConversionReport
+
+    def summary(self) -> str:
+        """Return what was found, written and left out, for people."""
+        table = Table("split", "images", "detection", "drivable", "lane", "boxes", "markings")
+        for split, images in self.report.images.items():
+            labelled, boxes = self.report.labelled[split], self.report.objects[split]
+            lanes = self.report.lanes[split]
+            table.add_row(
+                split,
+                str(images),
+                *(str(labelled.get(task, 0)) for task in ("detection", "drivable", "lane")),
+                ", ".join(f"{count} {name}" for name, count in boxes.items()),
+                ", ".join(f"{count} {name}" for name, count in lanes.items()),
+            )
+        lines = [*self.found, _rendered(table)]
+        for split, reasons in self.report.dropped.items():
+            lines += [f"{split}: left out {count} x {reason}" for reason, count in reasons.items()]
+        return "\n".join([*lines, f"written to {self.output}"])
+
+
+def convert(
+    source: str,
+    output: Path,
+    target: Path | None = None,
+    /,
+    *,
+    kind: Annotated[Literal["bdd100k", "coco", "yolo", "cvat", "masks"] | None, Parameter(name="--from")] = None,
+    classes: Path | None = None,
+    splits: Sequence[str] = (),
+    lane_width: Sequence[str] = (),
+    crosswalk: bool = False,
+    vertical: bool = False,
+    pair_edges: bool = True,
+    max_gap: float = 40.0,
+    keep_alternative: bool = False,
+    images: Literal["link", "copy", "symlink"] = "link",
+    workers: int = 0,
+) -> Converted:
+    """Convert a foreign data set to the published layout.
+
+    ``trilitenet data convert bdd100k RAW OUT`` and ``trilitenet data convert --from coco DIR OUT`` are the two ways to
+    say it. A conversion that was interrupted goes on where it stood; run again, it changes nothing.
+
+    Args:
+        source: What it is (bdd100k, coco, yolo, cvat, masks), or with --from the folder or annotation file itself.
+        output: The folder or file to convert; with --from, the folder to write.
+        target: The folder to write.
+        kind: What the source is, if it is not the first word.
+        classes: A YAML file with ``classes:`` (class name to categories), and for formats other than BDD100K what the
+            other names and mask values mean; see docs/data.md.
+        splits: Convert these splits alone.
+        lane_width: Width of lane markings in pixels of a 1280-pixel wide image, for all splits (``4``) or one
+            (``train=8``); 8 for train and 2 for others if left out.
+        crosswalk: Draw crosswalks as lane markings.
+        vertical: Draw markings across the road (stop lines) as lane markings.
+        pair_edges: Join the two edges that BDD100K draws of a marking into its centre line.
+        max_gap: Edges further apart than this, in pixels of a 1280-pixel wide image, are two markings.
+        keep_alternative: Keep alternative drivable areas apart, as mask value 127; training merges them.
+        images: Hard-link images (or copy, where that is impossible), copy them, or point symbolic links at them.
+        workers: Processes to share the work; one for each processor if 0.
+
+    Raises:
+        ConfigError: If the arguments or the YAML file are wrong.
+        DataError: If the source cannot be read.
+        OutputError: If the output holds something else.
+    """
+    chosen, raw, out = _arguments(source, output, target, kind)
+    mapping = read_mapping(classes)
+    options = ConversionOptions(
+        classes=mapping.classes,
+        ignore=mapping.ignore,
+        lane_width=_widths(lane_width),
+        crosswalk=crosswalk,
+        vertical=vertical,
+        pair_edges=pair_edges,
+        max_gap=max_gap,
+        keep_alternative=keep_alternative,
+        images=images,
+    )
+    records, found = _open_source(chosen, raw, mapping, options)
+    description = DatasetDescription(
+        name=mapping.name or out.name, licence=mapping.licence, source=f"{chosen}: {Path(raw).name}"
+    )
+    with _progress("images") as advance:
+        report = run_conversion(
+            records,
+            out,
+            options,
+            splits=splits or None,
+            workers=_workers(workers),
+            description=description,
+            progress=advance,
+        )
+    return Converted(out, found, report)
+
+
+@dataclasses.dataclass(frozen=True)
+class Checked:
+    """What `check` found.
+
+    Attributes:
+        report: Faults and counts.
+        files: The reports written.
+    """
+
+    report: CheckReport
+    files: tuple[Path, ...]
+
+    @property
+    def exit_code(self) -> int:
+        """1 if anything is wrong."""
+        return int(not self.report.ok)
+
+    def summary(self) -> str:
+        """Return tables of what is there and what is wrong, for people."""
+        report = self.report
+        counts = Table("split", "images", "detection", "drivable", "lane", "boxes")
+        for split, images in report.images.items():
+            labelled = report.labelled[split]
+            counts.add_row(
+                split,
+                str(images),
+                *(str(labelled.get(task, 0)) for task in ("detection", "drivable", "lane")),
+                ", ".join(f"{count} {name}" for name, count in report.objects[split].items()),
+            )
+        lines = [f"{report.root}: taken for {report.layout}", _rendered(counts)]
+        few = {key: values for key, values in report.conditions.items() if len(values) <= 12}
+        for key, values in few.items():
+            lines.append(f"{key}: " + ", ".join(f"{value} {sum(n.values())}" for value, n in values.items()))
+        lines.append(f"best possible recall of the anchors: {report.anchor_recall:.2%}")
+        if report.findings:
+            faults = Table("kind", "split", "count", "what", "for example")
+            for finding in report.findings:
+                faults.add_row(
+                    finding.kind, finding.split, str(finding.count), KINDS[finding.kind], finding.examples[0]
+                )
+            lines.append(_rendered(faults))
+        else:
+            lines.append("nothing wrong")
+        return "\n".join([*lines, *(f"written: {path}" for path in self.files)])
+
+
+def check(
+    root: Path,
+    *,
+    json_file: Annotated[Path | None, Parameter(name="--json")] = None,
+    html: Path | None = None,
+    pictures: int = 24,
+    workers: int = 0,
+) -> Checked:
+    """Look for faults in a data set, and count what is in it; exits 1 when something is wrong.
+
+    Args:
+        root: A data set in the published layout; another one is named, with the command that converts it.
+        json_file: Write the report as JSON.
+        html: Write the report as a page with plots and a contact sheet.
+        pictures: How many images the page shows.
+        workers: Processes to share the work; one for each processor if 0.
+
+    Raises:
+        DataError: If the layout is not the published one.
+        MissingExtraError: If the extra ``data`` is not installed.
+    """
+    with _progress("images") as advance:
+        report = check_dataset(root, workers=_workers(workers), progress=advance)
+    files: list[Path] = []
+    if json_file is not None:
+        _write(json_file, json.dumps(report.to_dict(), indent=1, ensure_ascii=False))
+        files.append(json_file)
+    if html is not None:
+        _write(html, check_page(report, _some_pictures(report, pictures)))
+        files.append(html)
+    return Checked(report, tuple(files))
+
+
+@dataclasses.dataclass(frozen=True)
+class Shown:
+    """What `show` wrote.
+
+    Attributes:
+        output: The picture or page.
+        count: Images on it.
+    """
+
+    output: Path
+    count: int
+
+    def summary(self) -> str:
+        """Return one line for people."""
+        return f"{self.count} images on {self.output}"
+
+
+def show(
+    root: Path,
+    output: Path,
+    *,
+    split: str = "",
+    where: Sequence[str] = (),
+    count: int = 24,
+    start: int = 0,
+    seed: int = 0,
+    columns: int = 4,
+    width: int = 320,
+) -> Shown:
+    """Draw images with their labels on a contact sheet (.jpg, .png) or a page (.html).
+
+    Only the images shown are read, and the annotations of those looked at for a condition, so it is quick for any
+    number of images.
+
+    Args:
+        root: A data set in the published layout.
+        output: The picture or page to write.
+        split: Show this split; all if left out.
+        where: Only images with an attribute, for example ``timeofday=night`` or ``source=city``; all must hold.
+        count: How many images a split.
+        start: Leave out the first so many: the next sheet of the same seed.
+        seed: Of the random order.
+        columns: Images a row of a contact sheet.
+        width: Of each image in pixels.
+
+    Raises:
+        DataError: If there is no such split, or no such image.
+        OutputError: If the ending of ``output`` is none of these.
+    """
+    if output.suffix.lower() not in {".jpg", ".jpeg", ".png", ".html"}:
+        raise OutputError(f"{output}: must end in .jpg, .png or .html")
+    wanted = dict(_pair(item) for item in where)
+    groups = {}
+    for name in [split] if split else _splits(root):
+        dataset = DrivingDataset(root, name)
+        indices = pick(dataset, wanted, count, seed=seed, start=start)
+        if indices:
+            groups[name] = (dataset, indices)
+    if not groups:
+        raise DataError(f"{root}: no image with {', '.join(where) or 'anything'} in {split or 'any split'}")
+    shown = sum(len(indices) for _, indices in groups.values())
+    if output.suffix.lower() == ".html":
+        pictures = {
+            f"{name}: {len(indices)} of {len(dataset)}": (_fitted(dataset, index, max(width, 480)) for index in indices)
+            for name, (dataset, indices) in groups.items()
+        }
+        _write(output, picture_page(f"{root.name} {' '.join(where)}".strip(), pictures))
+    else:
+        samples = [dataset[index] for dataset, indices in groups.values() for index in indices]
+        names = next(iter(groups.values()))[0].class_names
+        sheet = contact_sheet(samples, names, columns=columns, size=(width * 9 // 16, width))
+        output.parent.mkdir(parents=True, exist_ok=True)
+        if not cv2.imwrite(str(output), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR)):
+            raise OutputError(f"{output}: cannot be written")
+    return Shown(output, shown)
+
+
+@dataclasses.dataclass(frozen=True)
+class Prepared:
+    """What `prepare` wrote.
+
+    Attributes:
+        output: The prepared data set.
+        images: Split -> images.
+        size: Bytes on disk.
+        by_itself: Whether loading finds it by itself.
+    """
+
+    output: Path
+    images: dict[str, int]
+    size: int
+    by_itself: bool
+
+    def summary(self) -> str:
+        """Return a line for people."""
+        counts = ", ".join(f"{count} {split}" for split, count in self.images.items())
+        use = "training uses it by itself" if self.by_itself else "give this folder as the data"
+        return f"{counts} in {self.output} ({self.size / 2**20:.1f} MiB); {use}"
+
+
+def prepare(
+    root: Path,
+    output: Path | None = None,
+    *,
+    size: tuple[int, int] = (384, 640),
+    splits: Sequence[str] = (),
+    classes: Sequence[str] = (),
+    images: Literal["jpeg", "raw"] = "jpeg",
+    quality: int = 95,
+    mask_above: int = 1,
+    shard_size: int = 1000,
+    workers: int = 0,
+) -> Prepared:
+    """Pack a data set at training resolution into WebDataset shards, which training reads several times as fast.
+
+    Shards that are there and up to date are kept.
+
+    Args:
+        root: A data set in the published layout.
+        output: Folder to write; ``.prepared`` in the data set if left out, where training finds it by itself.
+        size: Height and width that training will use.
+        splits: Prepare these splits alone.
+        classes: Detection classes; those of the data set if left out.
+        images: ``jpeg`` is small; ``raw`` is about ten times larger and gives training exactly the same pixels.
+        quality: Of the JPEGs, of 100.
+        mask_above: A resized mask pixel above this, of 255, is foreground; the published rule is 1.
+        shard_size: Images a shard.
+        workers: Processes to share the work; one for each processor if 0.
+
+    Raises:
+        DataError: If the data set is broken.
+        OutputError: If the output holds something else, or was made with other settings.
+    """
+    with _progress("images") as advance:
+        counts = run_preparation(
+            root,
+            output,
+            canvas=size,
+            class_names=tuple(classes) or None,
+            splits=splits or None,
+            images=images,
+            quality=quality,
+            mask_above=mask_above,
+            shard_size=shard_size,
+            workers=_workers(workers),
+            progress=advance,
+        )
+    folder = output or root / CACHE_FOLDER
+    total = sum(path.stat().st_size for path in folder.iterdir())
+    return Prepared(folder, counts, total, by_itself=output is None)
+
+
+def _arguments(source: str, output: Path, target: Path | None, kind: str | None) -> tuple[str, str, Path]:
+    """Return (kind, what to convert, where to) of either way to say it."""
+    if kind is None:
+        if target is None:
+            raise ConfigError("say `data convert KIND SOURCE OUTPUT` or `data convert --from KIND SOURCE OUTPUT`")
+        kind, source, output = source, str(output), target
+    elif target is not None:
+        raise ConfigError("with --from, give SOURCE and OUTPUT alone")
+    known = ("bdd100k", "coco", "yolo", "cvat", "masks")
+    if kind not in known:
+        raise ConfigError(f"unknown kind of data set {kind!r}; known: {', '.join(known)}")
+    return kind, source, output
+
+
+def _open_source(
+    kind: str, raw: str, mapping: LabelMapping, options: ConversionOptions
+) -> tuple[RecordSource, tuple[str, ...]]:
+    if kind == "bdd100k":
+        bdd = read_bdd100k(raw, crosswalk=options.crosswalk, vertical=options.vertical)
+        return bdd, bdd.found
+    if kind == "yolo":
+        yolo = read_yolo(raw, mapping)
+        return yolo, yolo.found
+    readers = {"coco": read_coco, "cvat": read_cvat, "masks": read_masks}
+    listed = readers[kind](raw, mapping)
+    return listed, listed.found
+
+
+def _widths(items: Sequence[str]) -> dict[str, float]:
+    widths: dict[str, float] = {"train": 8.0, "*": 2.0}
+    for item in items:
+        split, _, text = item.rpartition("=")
+        try:
+            width = float(text)
+        except ValueError as error:
+            raise ConfigError(f"lane width must be a number or SPLIT=number, got {item!r}") from error
+        widths = {**widths, split: width} if split else {"*": width}
+    return widths
+
+
+def _pair(item: str) -> tuple[str, str]:
+    key, equals, value = item.partition("=")
+    if not equals:
+        raise ConfigError(f"--where wants ATTRIBUTE=VALUE, got {item!r}")
+    return key, value
+
+
+def _splits(root: Path) -> list[str]:
+    if is_prepared(root):
+        raise DataError(f"{root}: is a prepared data set; show the one that it was made from")
+    folder = root / IMAGE_FOLDER
+    splits = sorted(path.name for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+    if not splits:
+        raise DataError(f"{root}: looks like {detect_layout(root)[1]}, not the published layout (images/SPLIT, ...)")
+    return splits
+
+
+def _some_pictures(report: CheckReport, count: int) -> Any:
+    """Return a contact sheet of readable images, from all splits alike."""
+    samples: list[Sample] = []
+    names: tuple[str, ...] = ("vehicle",)
+    for split, images in report.images.items():
+        if not images:
+            continue
+        dataset = DrivingDataset(report.root, split)
+        names = dataset.class_names
+        for index in pick(dataset, {}, max(1, count // len(report.images))):
+            with contextlib.suppress(DataError):
+                samples.append(dataset[index])
+    return contact_sheet(samples, names) if samples else None
+
+
+def _fitted(dataset: DrivingDataset, index: int, width: int) -> Any:
+    sample = dataset[index]
+    drawn = draw_sample(sample, dataset.class_names)
+    box = Letterbox.fit(sample.size, long_side=width, stride=1)
+    return box.image(drawn)
+
+
+def _workers(workers: int) -> int:
+    count = workers or os.cpu_count() or 1
+    return 0 if count == 1 else count
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def _rendered(table: Table) -> str:
+    text = io.StringIO()
+    Console(file=text, width=140).print(table)
+    return text.getvalue().rstrip()
+
+
+@contextlib.contextmanager
+def _progress(what: str) -> Iterator[Progressed]:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(what, total=None)
+        yield lambda done, total: progress.update(task, completed=done, total=total)

@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.data.published import write_published
+from tests.formats.readers import raw_bdd
+from trilitenet.apps.cli import main
+from trilitenet.commands.data import check, convert, prepare, show
+from trilitenet.data.prepared import PreparedDataset, open_dataset
+from trilitenet.data.reading import DrivingDataset
+from trilitenet.errors import ConfigError, DataError, OutputError
+
+
+@pytest.fixture
+def raw(tmp_path: Path) -> Path:
+    root = tmp_path / "raw"
+    raw_bdd.write_images(root)
+    raw_bdd.write_2020(root)
+    return root
+
+
+@pytest.fixture
+def published(tmp_path: Path) -> Path:
+    root = tmp_path / "data"
+    write_published(root, "train", 12)
+    write_published(root, "val", 6, seed=1)
+    return root
+
+
+def test_convert_both_ways(raw: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["data", "convert", "bdd100k", str(raw), str(tmp_path / "one"), "--workers", "1"]) == 0
+    shown = capsys.readouterr().out
+    assert "train: 2 images; labels from labels/det_20/det_train.json (detection)" in shown
+    assert "left out 1 x lane: crosswalk" in shown
+    result = convert(str(raw), tmp_path / "two", kind="bdd100k", workers=1)
+    assert result.report.images == {"train": 2, "val": 1}
+    for path in (tmp_path / "one").rglob("*.png"):
+        assert path.read_bytes() == (tmp_path / "two" / path.relative_to(tmp_path / "one")).read_bytes()
+
+
+def test_convert_options(raw: Path, tmp_path: Path) -> None:
+    (tmp_path / "classes.yaml").write_text("classes: {small: [car], large: [bus, truck]}\nlicence: mine\n")
+    words = ["--classes", str(tmp_path / "classes.yaml"), "--lane-width", "train=40", "--max-gap", "100", "--crosswalk",
+             "--vertical", "--keep-alternative", "--splits", "train", "--workers", "1"]  # fmt: skip
+    assert main(["data", "convert", "bdd100k", str(raw), str(tmp_path / "out"), *words]) == 0
+    lane = cv2.imread(str(tmp_path / "out/ll_seg_annotations/train/a1.png"), 0)
+    np.testing.assert_array_equal(np.asarray(lane), raw_bdd.lane_truth(crosswalk=True, vertical=True))
+    dataset = DrivingDataset(tmp_path / "out", "train")
+    assert dataset.class_names == ("small", "large")
+    assert dataset.description.licence == "mine"
+    assert not (tmp_path / "out/images/val").exists()
+
+
+def test_convert_wants_its_words(raw: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="unknown kind of data set 'kitti'"):
+        convert("kitti", raw, tmp_path / "out")
+    with pytest.raises(ConfigError, match="data convert KIND SOURCE OUTPUT"):
+        convert("bdd100k", raw)
+    with pytest.raises(ConfigError, match="SOURCE and OUTPUT alone"):
+        convert("bdd100k", raw, tmp_path / "out", kind="bdd100k")
+    with pytest.raises(ConfigError, match="lane width"):
+        convert("bdd100k", raw, tmp_path / "out", lane_width=["wide"])
+
+
+def test_check_says_what_is_wrong(published: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("imagehash")
+    html, document = tmp_path / "report.html", tmp_path / "report.json"
+    words = ["data", "check", str(published), "--html", str(html), "--json", str(document), "--workers", "1"]
+    assert main(words) == 0
+    assert "nothing wrong" in capsys.readouterr().out
+    assert json.loads(document.read_text())["images"] == {"train": 12, "val": 6}
+    page = html.read_text()
+    assert page.count("<svg") >= 3
+    assert "data:image/jpeg;base64," in page
+    assert "http://" not in page
+    (published / "images/train/train_0001.jpg").write_bytes(b"<broken>")
+    assert main(words) == 1
+    shown = capsys.readouterr().out
+    assert "image-unreadable" in shown
+    assert "images/train/train_0001.jpg" in shown
+    assert json.loads(document.read_text())["findings"][0]["kind"] == "image-unreadable"
+    assert "image-unreadable" in html.read_text()
+    with pytest.raises(DataError, match="looks like nothing known"):
+        check(tmp_path)
+
+
+def test_show_sheets_and_pages(published: Path, tmp_path: Path) -> None:
+    sheet = tmp_path / "sheets/all.png"
+    assert show(published, sheet, count=4, columns=3, width=160).count == 8
+    picture = cv2.imread(str(sheet))
+    assert picture is not None
+    assert picture.shape == (3 * (90 + 18), 3 * 160, 3)
+    page = show(published, tmp_path / "night.html", split="train", where=["timeofday=night"])
+    # Annotated images alternate between day and night; one night image has no annotation.
+    assert page.count == 6
+    assert (tmp_path / "night.html").read_text().count("<img") == 6
+    rest = show(published, tmp_path / "rest.html", split="train", where=["timeofday=night"], start=4)
+    assert rest.count == 2
+    with pytest.raises(DataError, match="no image with timeofday=noon"):
+        show(published, sheet, where=["timeofday=noon"])
+    with pytest.raises(ConfigError, match="ATTRIBUTE=VALUE"):
+        show(published, sheet, where=["night"])
+    with pytest.raises(OutputError, match="must end in"):
+        show(published, tmp_path / "x.pdf")
+
+
+def test_prepare_and_read_back(published: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["data", "prepare", str(published), "--size", "64", "96", "--workers", "1"]) == 0
+    assert "training uses it by itself" in capsys.readouterr().out
+    assert isinstance(open_dataset(published, "train", canvas=(64, 96)), PreparedDataset)
+    result = prepare(published, tmp_path / "out", size=(64, 96), images="raw", workers=1)
+    assert result.images == {"train": 12, "val": 6}
+    assert not result.by_itself
+    with pytest.raises(DataError, match="prepared data set"):
+        show(tmp_path / "out", tmp_path / "x.png")
