@@ -261,7 +261,7 @@ def _objects(world: World, drawn: Rendering) -> tuple[ObjectTruth, ...]:
             continue
         mask = drawn.ids[y0:y1, x0:x1] == FIRST_VEHICLE + index
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        if not len(rows):
+        if len(rows) < 2 or len(columns) < 2:
             continue
         # An outline fills every pixel that it touches, so that it ends in the middle of the outermost ones, on average.
         box = np.array([x0 + columns[0], y0 + rows[0], x0 + columns[-1], y0 + rows[-1]], np.float32) + np.float32(0.5)

@@ -142,7 +142,7 @@ class _Strip:
         for kerb in layout.kerbs:
             self._stripe(kerb, 0.09, (168.0, 165.0, 158.0))
             self._stripe(kerb - 0.2 if kerb > 0 else kerb + 0.2, 0.1, (60.0, 59.0, 58.0), 0.35)
-        return np.clip(worn * np.float32(0.5) + np.float32(0.5), 0, 1)
+        return np.asarray(np.clip(worn * np.float32(0.5) + np.float32(0.5), 0, 1), np.float32)
 
     def _within(self, low: float, high: float) -> slice | None:
         return self._columns((low + high) / 2, self.foot + np.float32((high - low) / 2))

@@ -1,0 +1,192 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trilitenet.data.reading import DrivingDataset
+from trilitenet.data.sample import Sample
+from trilitenet.data.synthetic import Scene, SyntheticScenes
+from trilitenet.data.synthetic_drive import SyntheticDrive
+from trilitenet.data.synthetic_files import annotation, write_dataset
+from trilitenet.data.synthetic_render import FIRST_VEHICLE, render
+from trilitenet.errors import ConfigError, OutputError
+
+SIZE = (192, 320)
+
+
+@pytest.fixture(scope="module")
+def scenes() -> list[Scene]:
+    generator = SyntheticScenes(4, SIZE)
+    return [generator.scene(i) for i in range(24)]
+
+
+def test_a_scene_depends_on_seed_and_index_alone() -> None:
+    first, again = SyntheticScenes(7, SIZE), SyntheticScenes(7, SIZE)
+    again[0]  # another history
+    sample, other = first[3], again[3]
+    np.testing.assert_array_equal(sample.image, other.image)
+    np.testing.assert_array_equal(sample.boxes, other.boxes)
+    np.testing.assert_array_equal(sample.lane, other.lane)
+    assert not np.array_equal(first[3].image, first[4].image)
+    assert not np.array_equal(first[3].image, SyntheticScenes(8, SIZE)[3].image)
+
+
+def test_samples_are_whole_and_varied(scenes: list[Scene]) -> None:
+    for scene in scenes:
+        sample = scene.sample
+        assert sample.image.shape == (*SIZE, 3)
+        assert sample.boxes is not None
+        assert sample.class_id is not None
+        assert sample.drivable is not None
+        assert sample.lane is not None
+        for boxes in (sample.boxes, sample.ignored):
+            assert (boxes[:, 2:] > boxes[:, :2]).all()
+            assert boxes.min(initial=0) >= 0
+            assert (boxes[:, 2:] <= (SIZE[1], SIZE[0])).all()
+        assert set(np.unique(sample.drivable)) <= {0, 1}
+    assert len({scene.sample.attributes["weather"] for scene in scenes}) >= 3
+    assert len({scene.sample.attributes["timeofday"] for scene in scenes}) == 3
+    assert sum(len(scene.truth.objects) for scene in scenes) > 40
+    assert np.mean([scene.sample.drivable.mean() for scene in scenes]) > 0.1  # type: ignore[union-attr]
+
+
+def test_night_is_darker_than_day(scenes: list[Scene]) -> None:
+    bright = {"daytime": [0.0], "night": [0.0]}
+    for scene in scenes:
+        bright.setdefault(scene.sample.attributes["timeofday"], []).append(float(scene.sample.image.mean()))
+    assert np.mean(bright["daytime"][1:]) > 2 * np.mean(bright["night"][1:])
+
+
+def test_masks_stop_at_vehicles(scenes: list[Scene]) -> None:
+    drive = SyntheticDrive(2, frames=10, size=(180, 320))
+    drawn = render(drive.world(0.0), np.random.default_rng(0), faults=False)
+    vehicles = drawn.ids >= FIRST_VEHICLE
+    assert vehicles.sum() > 200
+    assert not (drawn.drivable.astype(bool) & vehicles).any()
+    assert not (drawn.lines.astype(bool) & vehicles).any()
+
+
+def test_boxes_are_the_visible_part_of_the_outline() -> None:
+    drive = SyntheticDrive(2, frames=10, size=(360, 640), faults=False)
+    drawn = render(drive.world(0.0), np.random.default_rng(0), faults=False)
+    scene = drive[0]
+    assert scene.sample.boxes is not None
+    for box in scene.sample.boxes:
+        left, top, right, bottom = (round(float(v)) for v in box)
+        marks, counts = np.unique(drawn.ids[top:bottom, left:right], return_counts=True)
+        best = marks[marks >= FIRST_VEHICLE][np.argmax(counts[marks >= FIRST_VEHICLE])]
+        rows, columns = np.nonzero(drawn.ids == best)
+        np.testing.assert_allclose(box, (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1), atol=0.51)
+
+
+def test_true_lines_run_through_the_lane_mask(scenes: list[Scene]) -> None:
+    checked = 0
+    for scene in scenes:
+        truth, lane = scene.truth, scene.sample.lane
+        assert lane is not None
+        hidden = np.zeros(SIZE, bool)
+        for line in truth.lines:
+            points = line.points[(line.points[:, 0] >= 5) & (line.points[:, 0] <= 30)]
+            for u, v in np.round(truth.camera.to_pixels(points)).astype(int):
+                if 2 <= u < SIZE[1] - 2 and 2 <= v < SIZE[0] - 2:
+                    checked += 1
+                    hidden[v, u] = not lane[v - 1 : v + 2, u - 1 : u + 2].any()
+        assert hidden.sum() < 60  # behind vehicles, poles and the bonnet
+    assert checked > 500
+
+
+def test_paint_leaves_the_gaps_of_dashes_out() -> None:
+    drive = SyntheticDrive(0, frames=2, size=(180, 320), faults=False)
+    truth, lane = drive[0].truth, drive[0].sample.lane
+    assert lane is not None
+    assert {"dashed", "solid"} <= {line.kind for line in truth.lines}
+    on_line, on_paint = [], []
+    for line in (line for line in truth.lines if line.kind == "dashed" and abs(line.d) < 3):
+        pixels = np.round(truth.camera.to_pixels(line.points[6:24])).astype(int)
+        on_line += [bool(lane[v, u]) for u, v in pixels]
+        on_paint += [bool(truth.paint[v, u]) for u, v in pixels]
+    assert np.mean(on_line) > 0.9
+    assert 0.05 < np.mean(on_paint) < 0.8
+
+
+def test_labels_can_be_the_paint() -> None:
+    lines, paint = SyntheticScenes(1, SIZE)[0].lane, SyntheticScenes(1, SIZE, labels="paint")
+    np.testing.assert_array_equal(paint[0].lane, paint.scene(0).truth.paint)
+    assert lines is not None
+    assert not np.array_equal(lines, paint.scene(0).truth.paint)
+
+
+def test_refuses_nonsense() -> None:
+    with pytest.raises(IndexError):
+        SyntheticScenes(0, SIZE, 3)[3]
+    with pytest.raises(ConfigError, match="labels"):
+        SyntheticScenes(labels="dots")  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="size"):
+        SyntheticScenes(size=(8, 8))
+    with pytest.raises(ConfigError, match="at least one frame"):
+        SyntheticDrive(frames=0)
+
+
+def test_written_scenes_read_back(tmp_path: Path) -> None:
+    write_dataset(tmp_path, "train", count=3, seed=9, size=SIZE)
+    data = DrivingDataset(tmp_path, "train")
+    assert len(data) == 3
+    for index in range(3):
+        made, read = SyntheticScenes(9, SIZE)[index], data[index]
+        assert made.name == read.name
+        assert made.boxes is not None
+        assert read.boxes is not None
+        np.testing.assert_allclose(read.boxes, made.boxes, atol=0.01)
+        np.testing.assert_allclose(read.ignored, made.ignored, atol=0.01)
+        np.testing.assert_array_equal(read.drivable, made.drivable)
+        np.testing.assert_array_equal(read.lane, made.lane)
+        # Channels in their order: JPEG changes a pixel by a little, a swap by much.
+        apart = np.abs(read.image.astype(float).mean((0, 1)) - made.image.astype(float).mean((0, 1)))
+        assert apart.max() < 2
+        assert read.attributes["timeofday"] == made.attributes["timeofday"]
+
+
+def test_writing_refuses_to_mix_with_what_is_there(tmp_path: Path) -> None:
+    write_dataset(tmp_path, "val", count=1, seed=1, size=SIZE)
+    with pytest.raises(OutputError, match="not empty"):
+        write_dataset(tmp_path, "val", count=1, seed=2, size=SIZE)
+    write_dataset(tmp_path, "train", count=1, seed=2, size=SIZE)
+    with pytest.raises(ConfigError, match="at least 1"):
+        write_dataset(tmp_path, "more", count=0)
+
+
+def test_uncertain_vehicles_are_written_as_crowd() -> None:
+    sample = Sample(
+        "a", np.zeros((4, 4, 3), np.uint8), np.array([[0, 0, 2, 2]], np.float32), np.zeros(1, np.int64),
+        np.array([[1, 1, 3, 3]], np.float32),
+    )  # fmt: skip
+    written = json.loads(json.dumps(annotation(sample)))
+    crowds = [item["attributes"]["crowd"] for item in written["frames"][0]["objects"]]
+    assert crowds == [False, True]
+
+
+def test_a_drive_hangs_together() -> None:
+    drive = SyntheticDrive(1, frames=250, fps=25, size=(180, 320), faults=False)
+    first, second = drive[50], drive[51]
+    change = np.abs(first.sample.image.astype(int) - second.sample.image).mean()
+    other = np.abs(first.sample.image.astype(int) - SyntheticDrive(2, frames=1, size=(180, 320))[0].sample.image).mean()
+    assert change < 0.5 * other
+    known = {o.number: o for o in first.truth.objects if o.distance < 60 and abs(o.speed) > 5}
+    step = 1 / 25
+    for after in second.truth.objects:
+        if (before := known.get(after.number)) is not None:
+            moved = (after.speed - second.truth.speed) * step
+            assert after.distance == pytest.approx(before.distance + moved, abs=0.12)
+
+
+def test_a_drive_changes_lanes_and_has_a_lead() -> None:
+    drive = SyntheticDrive(1, frames=250, fps=25, size=(96, 160), faults=False)
+    offsets = [drive[i].truth.offset for i in range(100, 240, 10)]
+    assert max(offsets) > 1.0  # nearing the line on the left
+    assert min(offsets) < -1.0  # and coming from the right into the next lane
+    assert abs(offsets[-1]) < 0.3
+    assert drive[0].truth.lead is not None
+    assert drive[0].truth.camera == drive[240].truth.camera

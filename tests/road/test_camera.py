@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trilitenet.data.synthetic import Scene
+from trilitenet.errors import ConfigError, OutputError
+from trilitenet.processing.geometry import Camera
+from trilitenet.road.camera import SelfCalibration, View, birds_eye, read_camera, write_camera
+from trilitenet.road.lanes import assign_positions, find_lines
+from trilitenet.road.structures import LaneLine
+
+CAMERA = Camera((720, 1280), 1100.0, 1105.0, 641.0, 355.0, 1.42, 0.03, -0.01, 0.005, (-0.3, 0.1, 0.001, 0.0, 0.0))
+
+OPENCV = """%YAML:1.0
+---
+image_width: 1280
+image_height: 720
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [1100., 0., 640., 0., 1100., 360., 0., 0., 1.]
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [0., 0., 0., 0., 0.]
+height: 1.4
+pitch: 3.0
+"""
+
+
+def test_a_camera_file_round_trip(tmp_path: Path) -> None:
+    write_camera(CAMERA, tmp_path / "camera.yaml")
+    read = read_camera(tmp_path / "camera.yaml")
+    for field in dataclasses.fields(Camera):
+        np.testing.assert_allclose(getattr(read, field.name), getattr(CAMERA, field.name), atol=1e-12)
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_camera(CAMERA, tmp_path / "none" / "camera.yaml")
+
+
+def test_reads_what_opencv_writes(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(OPENCV)
+    camera = read_camera(path)
+    assert (camera.fx, camera.cx, camera.size) == (1100.0, 640.0, (720, 1280))
+    assert camera.pitch == pytest.approx(np.radians(3.0))
+    assert camera.distortion == ()
+
+
+def test_a_field_of_view_is_enough(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text("image_width: 640\nimage_height: 360\nheight: 1.3\nfield_of_view: 70\n")
+    assert read_camera(path) == Camera.from_field_of_view((360, 640), 70.0, 1.3)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("image_width: 640\nimage_height: 360\nheight: 1.3\n", "needs camera_matrix, or field_of_view"),
+        ("image_width: 640\nimage_height: 360\nfield_of_view: 60\n", "missing key 'height'"),
+        ("image_width: 640\nimage_height: 360\nheight: 1.3\nfield_of_veiw: 60\n", "did you mean 'field_of_view'"),
+        ("image_width: 640\nimage_height: 360\nheight: 0\nfield_of_view: 60\n", "height must be positive"),
+        ("image_width: 640\nimage_height: 360\nheight: 1\ncamera_matrix: {data: [1, 2]}\n", "9 numbers, got 2"),
+        ("- 1\n", "must be a mapping"),
+        ("a: [\n", "not YAML"),
+    ],
+)
+def test_bad_camera_files_are_explained(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        read_camera(path)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_camera(tmp_path / "absent.yaml")
+
+
+def _positioned(scene: Scene) -> list[LaneLine]:
+    assert scene.sample.lane is not None
+    lines = find_lines(scene.sample.lane)
+    height, width = scene.sample.size
+    return assign_positions(lines, [float(line.column(height - 1.0)) - (width - 1) / 2 for line in lines])
+
+
+def test_calibrates_itself_from_the_lanes(drive: tuple[Scene, ...]) -> None:
+    truth = drive[0].truth
+    calibration = SelfCalibration(drive[0].sample.size, field_of_view=60.0, lane_width=truth.lane_width)
+    for scene in drive[:6]:
+        calibration.update(_positioned(scene))
+    assert calibration.camera is None  # a few frames do not convince it
+    for scene in drive[6:25]:
+        calibration.update(_positioned(scene))
+    camera = calibration.camera
+    assert camera is not None
+    assert camera.pitch == pytest.approx(truth.camera.pitch, abs=0.003)
+    assert camera.yaw == pytest.approx(truth.camera.yaw, abs=0.006)
+    assert camera.height == pytest.approx(truth.camera.height, rel=0.02)
+    assert abs(camera.pitch - truth.camera.pitch) < 3 * calibration.errors.pitch
+    assert calibration.errors.focal > 0.1  # lanes do not show the focal length
+
+
+def test_stays_unsure_without_lanes() -> None:
+    calibration = SelfCalibration((360, 640))
+    for _ in range(50):
+        calibration.update([])
+    assert calibration.camera is None
+    with pytest.raises(ConfigError, match="lane width"):
+        SelfCalibration((360, 640), lane_width=0.0)
+
+
+def test_the_picture_from_above_shows_lines_where_they_are(drive: tuple[Scene, ...]) -> None:
+    scene = drive[0]
+    truth = scene.truth
+    view = View(near=6.0, far=24.0, half_width=6.0, scale=20.0)
+    above = birds_eye(truth.paint * np.uint8(255), truth.camera, view)
+    assert above.shape == view.size == (360, 240)
+    solid = [line for line in truth.lines if line.kind == "solid" and 0 < line.d < 6]  # a lorry hides the right one
+    assert solid
+    for line in solid:
+        points = line.points[(line.points[:, 0] > 9) & (line.points[:, 0] < 22)]
+        pixels = np.round(view.to_pixels(points)).astype(int)
+        inside = pixels[(pixels[:, 0] > 2) & (pixels[:, 0] < 237)]
+        hit = [above[v, u - 1 : u + 2].max() > 120 for u, v in inside]
+        assert np.mean(hit) > 0.9
+
+
+def test_the_view_goes_there_and_back() -> None:
+    view = View()
+    points = np.array([[10.0, 2.0], [40.0, -5.0]])
+    pixels = np.concatenate([view.to_pixels(points), np.ones((2, 1))], axis=1)
+    np.testing.assert_allclose((pixels @ view.matrix.T)[:, :2], points)

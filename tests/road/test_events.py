@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import pytest
+
+from trilitenet.errors import ConfigError
+from trilitenet.road.events import EventDetector, EventThresholds
+from trilitenet.road.structures import EgoLane, Estimate, Event, LeadVehicle, Road
+
+
+def road(offset: float = 0.0, heading: float = 0.0, time: float | None = None) -> Road:
+    lane = EgoLane(Estimate(3.6, 0.1), Estimate(offset, 0.05), Estimate(heading, 0.002), None)
+    lead = None
+    if time is not None:
+        lead = LeadVehicle(0, 7, Estimate(20.0, 1.0), Estimate(20.0 / time, 0.5), Estimate(time, 0.3))
+    return Road(ego_lane=lane, lead=lead)
+
+
+def run(detector: EventDetector, roads: list[Road], start: float = 0.0) -> list[Event]:
+    events: list[Event] = []
+    for index, item in enumerate(roads):
+        events += detector.update(item, start + index / 25, index)
+    return events
+
+
+def test_drifting_over_the_line_begins_and_ends_once() -> None:
+    detector = EventDetector()
+    out = [road(0.02 * i, 0.02) for i in range(60)]  # 1.2 m to the left: 0.3 m over the line
+    back = [road(1.2 - 0.02 * i, -0.02) for i in range(60)]
+    events = run(detector, out + back)
+    assert [(e.kind, e.phase) for e in events] == [("lane_departure_left", "begin"), ("lane_departure_left", "end")]
+    assert events[0].value < 0.1
+    assert events[0].frame is not None
+    assert 40 <= events[0].frame <= 50  # 0.8 m left the vehicle's side 0.1 m from the line, and 0.12 s to be sure
+    assert detector.warnings == ()
+
+
+def test_weaving_about_the_threshold_is_one_event() -> None:
+    detector = EventDetector()
+    weave = [road(0.85 + 0.06 * (i % 2), 0.02 if i % 2 else 0.01) for i in range(100)]
+    assert len(run(detector, weave)) == 1
+
+
+def test_no_departure_when_steering_away_or_for_a_blink() -> None:
+    assert not run(EventDetector(), [road(1.0, -0.02)] * 50)
+    blink = [road(0.0)] * 10 + [road(1.0, 0.02)] * 2 + [road(0.0)] * 10
+    assert not run(EventDetector(), blink)
+
+
+def test_departure_to_the_right() -> None:
+    events = run(EventDetector(), [road(-1.0, -0.02)] * 20)
+    assert [(e.kind, e.phase) for e in events] == [("lane_departure_right", "begin")]
+
+
+def test_collision_warning_with_hysteresis() -> None:
+    detector = EventDetector()
+    times = [5.0, 4.0, 3.0, 2.5, 2.5, 2.5, 2.5, 2.5] + [3.2] * 30 + [3.6] * 30
+    events = run(detector, [road(time=t) for t in times])
+    assert [(e.kind, e.phase, e.track_id) for e in events] == [
+        ("forward_collision", "begin", 7),
+        ("forward_collision", "end", 7),
+    ]
+    assert events[0].timestamp == pytest.approx(6 / 25, abs=0.05)
+    assert events[1].timestamp > 38 / 25 + 0.4
+
+
+def test_says_nothing_of_what_it_does_not_know() -> None:
+    detector = EventDetector()
+    assert not run(detector, [Road()] * 50)
+    run(detector, [road(1.0, 0.02)] * 20)
+    assert detector.warnings == ("lane_departure_left",)
+    assert not run(detector, [Road()] * 50, start=1.0)  # a lane out of sight ends no departure
+    assert detector.warnings == ("lane_departure_left",)
+
+
+def test_an_event_as_json() -> None:
+    event = Event("forward_collision", "begin", 1.23456, 30, 2.5, 7)
+    assert event.to_dict() == {
+        "kind": "forward_collision", "phase": "begin", "timestamp": 1.235, "frame": 30, "value": 2.5, "track_id": 7,
+    }  # fmt: skip
+
+
+def test_thresholds_must_leave_room_for_hysteresis() -> None:
+    with pytest.raises(ConfigError, match="below"):
+        EventThresholds(collision_begin=3.0, collision_end=2.0)

@@ -1,0 +1,176 @@
+"""Figures in metres against exact truth: the geometry alone, fed with true masks and boxes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from importlib import resources
+
+import jsonschema
+import numpy as np
+import pytest
+
+from trilitenet.data.synthetic import Scene
+from trilitenet.errors import ShapeError
+from trilitenet.processing.geometry import Camera
+from trilitenet.road.monitor import RoadMonitor
+from trilitenet.road.structures import Road
+from trilitenet.road.tracking import Steady
+from trilitenet.structures import Perception
+
+Perceive = Callable[[Scene], Perception]
+
+
+@pytest.fixture(scope="module")
+def roads(drive: tuple[Scene, ...], perceived: Perceive) -> list[Road]:
+    monitor = RoadMonitor(drive[0].truth.camera)
+    return [monitor(perceived(scene)) for scene in drive]
+
+
+def test_offset_heading_and_curvature(drive: tuple[Scene, ...], roads: list[Road]) -> None:
+    offsets, headings, bends = [], [], []
+    for scene, road in zip(drive, roads, strict=True):
+        lane, truth = road.ego_lane, scene.truth
+        assert lane is not None
+        assert lane.offset is not None
+        assert lane.heading is not None
+        half = truth.lane_width / 2
+        apart = abs(lane.offset.value - truth.offset)
+        # On the line between two lanes, which of them is the own one is a matter of centimetres.
+        if half - abs(truth.offset) < 0.1:
+            apart = min(apart, abs(apart - truth.lane_width))
+        offsets.append(apart)
+        headings.append(abs(lane.heading.value - truth.heading))
+        if lane.curvature is not None:
+            bends.append(abs(lane.curvature.value - truth.curvature))
+        assert apart < 5 * lane.offset.error
+    assert max(offsets) < 0.10
+    assert max(headings) < 0.01
+    assert len(bends) > 40
+    assert max(bends) < 0.003
+
+
+def test_lane_width(drive: tuple[Scene, ...], roads: list[Road]) -> None:
+    widths = [road.ego_lane.width.value for road in roads if road.ego_lane and road.ego_lane.width]
+    assert len(widths) > 50
+    np.testing.assert_allclose(widths, drive[0].truth.lane_width, atol=0.1)
+
+
+def test_distance_to_the_lead(drive: tuple[Scene, ...], roads: list[Road]) -> None:
+    shares = []
+    for scene, road in zip(drive, roads, strict=True):
+        lead = scene.truth.lead
+        if lead is not None and lead.distance <= 40:
+            assert road.lead is not None
+            shares.append(abs(road.lead.distance.value / lead.distance - 1))
+            assert abs(road.lead.distance.value - lead.distance) < 3 * road.lead.distance.error
+    assert len(shares) > 25
+    assert max(shares) < 0.05
+
+
+def test_closing_speed_and_time_to_collision(drive: tuple[Scene, ...], roads: list[Road]) -> None:
+    errors = []
+    for scene, road in zip(drive, roads, strict=True):
+        lead = scene.truth.lead
+        if lead is None or lead.distance > 30 or road.lead is None or road.lead.closing_speed is None:
+            continue
+        errors.append(abs(road.lead.closing_speed.value - (scene.truth.speed - lead.speed)))
+        if road.lead.time_to_collision is not None:
+            assert road.lead.closing_speed.value > 0.5
+    assert len(errors) > 15
+    assert np.median(errors) < 0.7
+
+
+def test_the_change_of_lanes_is_one_departure_to_the_left(roads: list[Road]) -> None:
+    events = [event for road in roads for event in road.events]
+    assert [(event.kind, event.phase) for event in events] == [
+        ("lane_departure_left", "begin"),
+        ("lane_departure_left", "end"),
+    ]
+    assert 6.0 < events[0].timestamp < 11.0
+
+
+def test_lines_keep_their_identity(roads: list[Road]) -> None:
+    left = [road.ego_lines[0].id for road in roads[:20] if road.ego_lines[0]]
+    assert len(left) == 20
+    assert len(set(left)) == 1
+
+
+def test_drivable_outlines_cover_the_mask(drive: tuple[Scene, ...], roads: list[Road]) -> None:
+    from trilitenet.processing.polygons import polygons_to_mask
+
+    mask = drive[0].sample.drivable
+    assert mask is not None
+    drawn = polygons_to_mask(roads[0].drivable, drive[0].sample.size)
+    assert (drawn & (mask > 0)).sum() / (drawn | (mask > 0)).sum() > 0.95
+
+
+def test_without_a_camera_it_calibrates_itself(drive: tuple[Scene, ...], perceived: Perceive) -> None:
+    monitor = RoadMonitor(lane_width=drive[0].truth.lane_width)
+    found = [monitor(perceived(scene)) for scene in drive]
+    assert found[0].camera is None
+    assert found[0].ego_lane is None
+    assert found[0].lines  # curves need no camera
+    offsets = [
+        abs(road.ego_lane.offset.value - scene.truth.offset)
+        for scene, road in zip(drive, found, strict=True)
+        if road.ego_lane and road.ego_lane.offset and abs(scene.truth.offset) < 1.5
+    ]
+    assert len(offsets) > 35
+    assert max(offsets) < 0.12
+    assert found[-1].calibrated == "lanes"
+
+
+def test_a_wrong_horizon_is_told_by_the_error(drive: tuple[Scene, ...], perceived: Perceive) -> None:
+    import dataclasses
+
+    true = drive[0].truth.camera
+    wrong = RoadMonitor(dataclasses.replace(true, pitch=true.pitch + 0.02), still=True)
+    right = RoadMonitor(true, still=True)
+    for scene in drive[8:24:4]:
+        bad, good = wrong(perceived(scene)).lead, right(perceived(scene)).lead
+        assert good is not None
+        assert bad is None or bad.distance.error > 3 * good.distance.error
+
+
+def test_nothing_in_sight_gives_nothing() -> None:
+    camera = Camera.from_field_of_view((360, 640), 60.0, 1.4)
+    road = RoadMonitor(camera)(Perception((360, 640), lane=np.zeros((360, 640), bool)))
+    assert road.lines == ()
+    assert road.ego_lane is None
+    assert road.lead is None
+    assert RoadMonitor()(Perception((360, 640))).to_dict()["camera"] is None
+
+
+def test_a_camera_of_another_shape_is_refused() -> None:
+    camera = Camera.from_field_of_view((480, 640), 60.0, 1.4)
+    with pytest.raises(ShapeError, match="another shape"):
+        RoadMonitor(camera)(Perception((360, 640)))
+
+
+def test_a_camera_of_another_resolution_is_scaled(drive: tuple[Scene, ...], perceived: Perceive) -> None:
+    camera = drive[0].truth.camera.resized((720, 1280))
+    lane = RoadMonitor(camera, still=True)(perceived(drive[0])).ego_lane
+    assert lane is not None
+    assert lane.offset is not None
+    assert lane.offset.value == pytest.approx(drive[0].truth.offset, abs=0.1)
+
+
+def test_the_json_follows_the_schema(drive: tuple[Scene, ...], perceived: Perceive, roads: list[Road]) -> None:
+    text = resources.files("trilitenet.formats").joinpath("schema/perception-1.0.json").read_text()
+    schema = json.loads(text)
+    schema = {"$schema": schema["$schema"], "$defs": schema["$defs"], "$ref": "#/$defs/road"}
+    for road in (roads[0], roads[30], roads[59], RoadMonitor()(perceived(drive[0]))):
+        jsonschema.validate(json.loads(json.dumps(road.to_dict())), schema)
+    assert roads[30].to_dict()["lead"] is not None
+
+
+def test_with_tracks_the_lead_keeps_its_number(drive: tuple[Scene, ...], perceived: Perceive) -> None:
+    pytest.importorskip("edgefirst.tracker")
+    steady, monitor = Steady(track=True), RoadMonitor(drive[0].truth.camera)
+    tracks = []
+    for scene in drive[:24]:
+        road = monitor(steady(perceived(scene)))
+        if road.lead is not None and scene.truth.lead is not None:
+            tracks.append((road.lead.track_id, scene.truth.lead.number))
+    assert len(set(tracks[4:])) == 1

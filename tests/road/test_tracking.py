@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from trilitenet.errors import ConfigError, MissingExtraError
+from trilitenet.road.structures import LaneLine
+from trilitenet.road.tracking import LineTracker, MaskSmoother, Steady, VehicleTracker, flicker
+from trilitenet.structures import Boxes, Perception
+
+
+def boxes(*left: float, confidence: float = 0.9) -> Boxes:
+    xyxy = np.array([[x, 100, x + 60, 150] for x in left], np.float32).reshape(-1, 4)
+    return Boxes(xyxy, np.full(len(left), confidence, np.float32), np.zeros(len(left), np.int64))
+
+
+def test_vehicles_keep_their_numbers_while_they_move() -> None:
+    pytest.importorskip("edgefirst.tracker")
+    tracker = VehicleTracker()
+    seen = []
+    for frame in range(12):
+        # The order of the boxes says nothing of who is who.
+        found = (10.0 + 4 * frame, 400.0 - 5 * frame)
+        order = found if frame % 2 else found[::-1]
+        tracked = tracker.update(boxes(*order), frame / 25)
+        assert tracked.track_id is not None
+        pair = tracked.track_id.tolist()
+        seen.append(pair if frame % 2 else pair[::-1])
+    assert len({tuple(pair) for pair in seen[3:]}) == 1
+    assert len(set(seen[-1])) == 2
+    assert min(seen[-1]) >= 1
+
+
+def test_a_vehicle_that_fades_keeps_its_number_and_a_lost_one_does_not_return() -> None:
+    pytest.importorskip("edgefirst.tracker")
+    tracker = VehicleTracker(memory=0.5)
+    for frame in range(8):
+        tracked = tracker.update(boxes(100.0), frame / 25)
+    assert tracked.track_id is not None
+    number = int(tracked.track_id[0])
+    faint = tracker.update(boxes(101.0, confidence=0.2), 8 / 25)
+    assert faint.track_id is not None
+    assert int(faint.track_id[0]) == number
+    for frame in range(60):
+        assert len(tracker.update(Boxes.empty(), (9 + frame) / 25)) == 0
+    again = tracker.update(boxes(101.0), 80 / 25)
+    again = tracker.update(boxes(101.0), 81 / 25)
+    assert again.track_id is not None
+    assert int(again.track_id[0]) != number
+
+
+def test_says_which_extra_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "edgefirst.tracker", None)
+    with pytest.raises(MissingExtraError, match=r"trilitenet\[track\]"):
+        Steady(track=True)
+    Steady(track=False, smoothing=0.5)
+
+
+def _line(bottom: float) -> LaneLine:
+    points = np.array([[bottom, 350], [bottom, 200]], np.float32)
+    return LaneLine(0, 0, points, np.array([bottom, 0, 0, 0, 0, 0.0]), (350.0, -150.0), 0.1, 0.9)
+
+
+def test_lines_are_followed_by_place() -> None:
+    tracker = LineTracker((360, 640), memory=3)
+    first = [line.id for line in tracker.update([_line(100), _line(500)])]
+    moved = tracker.update([_line(490), _line(110)])
+    assert [line.id for line in moved] == first[::-1]
+    tracker.update([_line(120)])
+    back = tracker.update([_line(125), _line(485)])
+    assert [line.id for line in back] == first
+    for _ in range(5):
+        tracker.update([])
+    assert not {line.id for line in tracker.update([_line(125)])} & set(first)
+
+
+def test_smoothing_calms_a_flickering_mask_and_keeps_a_still_one(rng: np.random.Generator) -> None:
+    solid = np.zeros((60, 80), bool)
+    solid[30:, 20:60] = True
+    noisy = [solid ^ (rng.random(solid.shape) < 0.05) for _ in range(30)]
+    smoother = MaskSmoother(0.7)
+    calm = [smoother.update(mask) for mask in noisy]
+    assert flicker(calm) < 0.2 * flicker(noisy)
+    assert (calm[-1] == solid).mean() > 0.99
+    assert flicker([solid, solid]) == 0.0
+    steady = MaskSmoother(0.0)
+    np.testing.assert_array_equal(steady.update(noisy[0]), noisy[0])
+    np.testing.assert_array_equal(steady.update(noisy[1]), noisy[1])
+
+
+def test_smoothing_follows_a_lasting_change_and_a_new_size() -> None:
+    smoother = MaskSmoother(0.6)
+    smoother.update(np.zeros((10, 10), bool))
+    on = np.ones((10, 10), bool)
+    answers = [bool(smoother.update(on).all()) for _ in range(4)]
+    assert answers == [False, True, True, True]
+    assert smoother.update(np.ones((5, 5), bool)).shape == (5, 5)
+    with pytest.raises(ConfigError, match="below 1"):
+        MaskSmoother(1.0)
+
+
+def test_steady_leaves_absent_tasks_absent() -> None:
+    perception = Steady(smoothing=0.5)(Perception((4, 6)))
+    assert perception.boxes is None
+    assert perception.drivable is None
