@@ -49,7 +49,7 @@ def test_test_files_mirror_the_package() -> None:
     """A test of one module lives in that module's layer: tests/<layer>/test_<module>.py."""
     layers = {path.name for path in PACKAGE.iterdir() if path.is_dir() and (path / "__init__.py").exists()}
     folders = {path.name for path in (ROOT / "tests").iterdir() if path.is_dir() and any(path.glob("test_*.py"))}
-    assert folders <= layers | {"parity", "benchmarks", "recipes"}
+    assert folders <= layers | {"parity", "benchmarks", "recipes", "ros2"}
 
 
 def test_every_test_folder_is_a_package() -> None:
