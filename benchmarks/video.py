@@ -26,7 +26,8 @@ from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, VideoReader
 from trilitenet.inference.video import VideoWriter
 from trilitenet.processing.drawing import draw
-from trilitenet.structures import Perception
+from trilitenet.processing.letterbox import Letterbox
+from trilitenet.structures import Perception, RawOutputs
 
 
 def pure_inference(predictor: Predictor, batch: np.ndarray, frames: int) -> float:
@@ -55,9 +56,9 @@ def stages(predictor: Predictor, video: Path, frames: int) -> dict[str, float]:
 
     images: list[np.ndarray] = []
     measure("decode", lambda: images.extend(f.image for f in VideoReader(video, Clip(max_frames=frames))))
-    boxed = []
+    boxed: list[tuple[np.ndarray, Letterbox]] = []
     measure("letterbox", lambda: boxed.extend(predictor.preprocess(image) for image in images))
-    raws = []
+    raws: list[RawOutputs] = []
     size = predictor.batch_size
     batches = [np.stack([canvas for canvas, _ in boxed[i : i + size]]) for i in range(0, frames, size)]
     measure("inference", lambda: raws.extend(predictor.backend.run(batch) for batch in batches))

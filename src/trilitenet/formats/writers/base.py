@@ -60,6 +60,7 @@ class Writer(abc.ABC):
         self.overwrite = overwrite
         self.files: list[Path] = []
         self._stems: dict[str, str] = {}
+        self._taken: set[str] = set()
         self._names: dict[str, str] = {}
         self._unnamed = 0
 
@@ -119,13 +120,13 @@ class Writer(abc.ABC):
             return f"image-{self._unnamed:06d}"
         if source not in self._stems:
             stem = PurePath(source).stem or "image"
-            taken = set(self._stems.values())
             number = 1
             name = stem
-            while name in taken:
+            while name in self._taken:
                 number += 1
                 name = f"{stem}-{number}"
             self._stems[source] = name
+            self._taken.add(name)
         return self._stems[source]
 
     def image_name(self, perception: Perception) -> str:
