@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilitenet.config import ModelCard
+from trilitenet.deploy.triton import TensorSpec, read_tensors, write_triton_repository
+from trilitenet.errors import ConfigError, OutputError, WeightsError
+
+onnx = pytest.importorskip("onnx")
+text_format = pytest.importorskip("google.protobuf.text_format")
+
+
+@pytest.fixture(scope="module")
+def schema() -> Any:
+    """Triton's own definition of config.pbtxt, out of tritonclient, without the gRPC around it."""
+    package = pytest.importorskip("tritonclient")
+    path = Path(next(iter(package.__path__))) / "grpc" / "model_config_pb2.py"
+    spec = importlib.util.spec_from_file_location("model_config_pb2", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _artefact(path: Path, batch: int | str = "batch") -> Path:
+    """A graph with an input and outputs like the network's."""
+    helper = onnx.helper
+    image = helper.make_tensor_value_info("image", onnx.TensorProto.UINT8, [batch, 384, 640, 3])
+    lane = helper.make_tensor_value_info("lane", onnx.TensorProto.UINT8, [batch, 384, 640, 3])
+    boxes = helper.make_tensor_value_info("detection", onnx.TensorProto.FLOAT, [batch, "candidates", 6])
+    weight = helper.make_tensor("weight", onnx.TensorProto.FLOAT, [1, 1, 6], np.zeros(6, np.float32))
+    nodes = [helper.make_node("Identity", ["image"], ["lane"]), helper.make_node("Identity", ["weight"], ["detection"])]
+    graph = helper.make_graph(nodes, "network", [image], [boxes, lane], [weight])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9), path)
+    return path
+
+
+def _parse(schema: Any, model: Path) -> Any:
+    return text_format.Parse((model / "config.pbtxt").read_text(encoding="utf-8"), schema.ModelConfig())
+
+
+def test_the_config_says_what_the_artefact_is(tmp_path: Path, schema: Any) -> None:
+    card = ModelCard("small", class_names=("car", 'a "quoted"\nname'), licence="frei, für alle")
+    artefact = _artefact(tmp_path / "x.onnx")
+    model = write_triton_repository(artefact, tmp_path / "repository", card, max_batch=4, delay=0.003)
+    config = _parse(schema, model)
+    assert (config.name, config.backend, config.max_batch_size) == ("trilitenet_small", "onnxruntime", 4)
+    assert model.name == config.name
+    (image,) = config.input
+    assert (image.name, image.data_type, list(image.dims)) == ("image", schema.TYPE_UINT8, [384, 640, 3])
+    assert [(o.name, o.data_type, list(o.dims)) for o in config.output] == [
+        ("detection", schema.TYPE_FP32, [-1, 6]),
+        ("lane", schema.TYPE_UINT8, [384, 640, 3]),
+    ]
+    assert config.dynamic_batching.max_queue_delay_microseconds == 3000
+    assert config.instance_group[0].kind == schema.ModelInstanceGroup.KIND_CPU
+    assert ModelCard.from_json(config.parameters["trilitenet.card"].string_value, "x") == card
+    assert (model / "1" / "model.onnx").read_bytes() == artefact.read_bytes()
+
+
+def test_a_fixed_batch_is_part_of_the_shape(tmp_path: Path, schema: Any) -> None:
+    model = write_triton_repository(
+        _artefact(tmp_path / "x.onnx", 1), tmp_path / "repository", ModelCard("tiny"), name="mine", gpu=True
+    )
+    config = _parse(schema, model)
+    assert (config.name, config.max_batch_size) == ("mine", 0)
+    assert list(config.input[0].dims) == [1, 384, 640, 3]
+    assert not config.HasField("dynamic_batching")
+    assert config.instance_group[0].kind == schema.ModelInstanceGroup.KIND_GPU
+
+
+def test_openvino_models_bring_their_weights(tmp_path: Path, schema: Any) -> None:
+    openvino = pytest.importorskip("openvino")
+    openvino.save_model(openvino.convert_model(str(_artefact(tmp_path / "x.onnx"))), tmp_path / "y.xml")
+    assert read_tensors(tmp_path / "y.xml")[0] == [TensorSpec("image", "UINT8", (-1, 384, 640, 3))]
+    model = write_triton_repository(tmp_path / "y.xml", tmp_path / "repository", ModelCard("tiny"))
+    assert _parse(schema, model).backend == "openvino"
+    assert {file.name for file in (model / "1").iterdir()} == {"model.xml", "model.bin"}
+
+
+def test_external_data_is_brought_along(tmp_path: Path) -> None:
+    artefact = _artefact(tmp_path / "x.onnx")
+    (tmp_path / "x.onnx.data").write_bytes(b"weights")
+    model = write_triton_repository(artefact, tmp_path / "repository", ModelCard("tiny"))
+    assert (model / "1" / "x.onnx.data").read_bytes() == b"weights"
+
+
+def test_mistakes_are_named(tmp_path: Path) -> None:
+    card = ModelCard("tiny")
+    with pytest.raises(WeightsError, match="no such file"):
+        write_triton_repository(tmp_path / "x.onnx", tmp_path, card)
+    with pytest.raises(ConfigError, match=r"\.onnx or \.xml"):
+        write_triton_repository(tmp_path / "x.safetensors", tmp_path, card)
+    broken = tmp_path / "broken.onnx"
+    broken.write_bytes(b"\xff\xfe\xfd no model")
+    with pytest.raises(WeightsError, match="no ONNX model"):
+        write_triton_repository(broken, tmp_path, card)
+    artefact = _artefact(tmp_path / "x.onnx")
+    write_triton_repository(artefact, tmp_path / "repository", card)
+    with pytest.raises(OutputError, match="exists already"):
+        write_triton_repository(artefact, tmp_path / "repository", card)
