@@ -22,7 +22,7 @@ DEVELOP := $(VENV)/.installed-develop
 DOCUMENT := $(VENV)/.installed-docs
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check format docs clean distclean
+.PHONY: help demo test browser check format docs clean distclean
 
 help: ## list the targets
 	@awk -F':.*## ' '/^[a-z]+:.*## /{printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -37,6 +37,10 @@ demo: $(RUNTIME) ## draw the three tasks on synthetic scenes, into demo-output/
 
 test: $(DEVELOP) ## run the test suite
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) $(PYTEST_ARGS)
+
+browser: ## install Chromium for the tests of the page (Debian, Ubuntu; as root); without it they are skipped
+	apt-get update -qq
+	DEBIAN_FRONTEND=noninteractive apt-get install -qq --yes --no-install-recommends chromium chromium-driver
 
 check: $(DEVELOP) ## lint, formatting, types and layers
 	$(BIN)/ruff check .
