@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from trilitenet.commands.load import load
 from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER, DrivingDataset
+from trilitenet.engine.evaluate import EvaluatedPredictor
 from trilitenet.engine.evaluate import evaluate as run_evaluation
 from trilitenet.engine.predictions import PredictionWriter
 from trilitenet.engine.provenance import hash_files
-from trilitenet.engine.report import Report
+from trilitenet.engine.report import Report, Variation
+from trilitenet.engine.robustness import corrupted_figures, figures_by_size
 from trilitenet.engine.scorecard import CONDITIONS
-from trilitenet.errors import OutputError
+from trilitenet.errors import ConfigError, OutputError
+from trilitenet.inference.predictor import Predictor
+from trilitenet.processing.corruptions import SEVERITIES
 
 __all__ = ["evaluate", "hash_dataset", "hash_model", "write_report"]
 
@@ -42,6 +48,9 @@ def evaluate(
     drivable: float | None = None,
     lane: float | None = None,
     long_side: int | None = None,
+    corruptions: bool = False,
+    severities: Sequence[int] = SEVERITIES,
+    resolution: Sequence[int] = (),
 ) -> Report:
     """Measure a model on labelled images, under the published protocol, a fair one, or both.
 
@@ -65,7 +74,10 @@ def evaluate(
         iou: A box goes when it overlaps a better one by more; the model's own if left out.
         drivable: A pixel is drivable above this probability; the model's own if left out.
         lane: A pixel is lane marking above this probability; the model's own if left out.
-        long_side: The longer side of an image is resized to so many pixels.
+        long_side: The longer side of an image is resized to so many pixels; by default as in training.
+        corruptions: Measure on images with the fifteen common corruptions too: fifteen more passes a severity.
+        severities: Severities of the corruptions, 1 to 5.
+        resolution: Measure at these longer sides of the input too.
 
     Returns:
         The report.
@@ -105,8 +117,29 @@ def evaluate(
                 "data_sha256": hash_dataset(dataset, limit),
             },
         )
+        variations: list[Variation] = []
+        settings: dict[str, Any] = {
+            "protocol": protocol,
+            "batch_size": batch_size,
+            "limit": limit,
+            "paper_batch": paper_batch,
+        }
+        if corruptions:
+            variations += corrupted_figures(predictor, dataset, report, severities=severities, **settings)
+        if resolution:
+            variations += figures_by_size(_resized(predictor, resolution), dataset, **settings)
+        report = dataclasses.replace(report, variations=tuple(variations))
     write_report(report, output)
     return report
+
+
+def _resized(predictor: Predictor, sides: Sequence[int]) -> dict[int, EvaluatedPredictor]:
+    if predictor.backend.canvas is not None:
+        height, width = predictor.backend.canvas
+        raise ConfigError(
+            f"this model's input is fixed to {width}x{height}; --resolution needs one that takes any size"
+        )
+    return {side: Predictor(predictor.backend, predictor.thresholds, long_side=side) for side in sides}
 
 
 def hash_model(model: str) -> str | None:
@@ -124,8 +157,6 @@ def hash_model(model: str) -> str | None:
 
 def hash_file(path: Path) -> str:
     """Return the SHA-256 of a file, as ``sha256sum`` prints it."""
-    import hashlib
-
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Final, Protocol, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -361,18 +362,26 @@ def _score_one(
             lane=None if raw.lane is None else threshold_mask(raw.lane[index], letterbox, low.lane),
         )
     if "paper" in protocols:
+        published = Letterbox.fit(letterbox.source)
         canvas = CanvasPrediction(
             boxes=paper_boxes,
-            drivable=_argmax(raw.drivable, index, letterbox),
-            lane=_argmax(raw.lane, index, letterbox),
-            letterbox=letterbox,
+            drivable=_argmax(raw.drivable, index, letterbox, published),
+            lane=_argmax(raw.lane, index, letterbox, published),
+            letterbox=published,
         )
     score(sample, (perception, canvas))
 
 
-def _argmax(masks: NDArray[np.uint8] | None, index: int, letterbox: Letterbox) -> NDArray[np.bool_] | None:
-    """Decide by the likelier of the two classes, inside the padding."""
-    return None if masks is None else np.asarray(masks[index][letterbox.inside] > 127)
+def _argmax(
+    masks: NDArray[np.uint8] | None, index: int, letterbox: Letterbox, published: Letterbox
+) -> NDArray[np.bool_] | None:
+    """Decide by the likelier of the two classes, padding cropped, at the size the image has in the published canvas."""
+    if masks is None:
+        return None
+    inside = masks[index][letterbox.inside]
+    if letterbox.resized != published.resized:
+        inside = cv2.resize(inside, published.resized[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray(inside > 127)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -87,12 +87,14 @@ class Variation:
         name: For example ``"fog 3"`` or ``"512"``.
         figures: Figure key -> value.
         note: How to read the table.
+        detail: Left out of tables, which show the means; the JSON has it.
     """
 
     kind: str
     name: str
     figures: dict[str, float]
     note: str = ""
+    detail: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -328,7 +330,7 @@ def _condition_table(protocol: str, conditions: tuple[Condition, ...]) -> Table:
 def _variation_tables(variations: tuple[Variation, ...]) -> list[Table]:
     tables = []
     for kind in dict.fromkeys(variation.kind for variation in variations):
-        members = [variation for variation in variations if variation.kind == kind]
+        members = [variation for variation in variations if variation.kind == kind and not variation.detail]
         keys = [key for key in HEADLINES if key in members[0].figures]
         table = Table(title=f"{kind} (per cent)", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
         table.add_column("")
@@ -409,6 +411,7 @@ def read_report(path: Path) -> Report:
                     row["name"],
                     {key: _number(value) for key, value in row["figures"].items()},
                     row["note"],
+                    row["detail"],
                 )
                 for row in mapping["variations"]
             ),

@@ -180,7 +180,7 @@ def _variations(report: Report) -> str:
         return ""
     parts = []
     for kind in dict.fromkeys(variation.kind for variation in report.variations):
-        members = [variation for variation in report.variations if variation.kind == kind]
+        members = [variation for variation in report.variations if variation.kind == kind and not variation.detail]
         keys = [key for key in HEADLINES if key in members[0].figures]
         head = "".join(f'<th class="n">{key.split("/")[1]}<br>{escape(meaning(key).title)}</th>' for key in keys)
         rows = "".join(
