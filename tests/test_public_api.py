@@ -18,6 +18,7 @@ PUBLIC = {
     "build_network",
     "load",
     "load_network",
+    "train",
 }
 
 

@@ -18,6 +18,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from trilitenet.commands.load import load as load
+    from trilitenet.commands.train import train as train
     from trilitenet.inference.predictor import Predictor as Predictor
     from trilitenet.models.trilitenet import build_network as build_network
     from trilitenet.models.weights import load_network as load_network
@@ -31,9 +32,10 @@ _PUBLIC = {
     "build_network": "trilitenet.models.trilitenet",
     "load": "trilitenet.commands.load",
     "load_network": "trilitenet.models.weights",
+    "train": "trilitenet.commands.train",
 }
 
-__all__ = ["Boxes", "Perception", "Predictor", "__version__", "build_network", "load", "load_network"]
+__all__ = ["Boxes", "Perception", "Predictor", "__version__", "build_network", "load", "load_network", "train"]
 
 
 def __getattr__(name: str) -> Any:

@@ -125,7 +125,8 @@ def main(words: Sequence[str] | None = None) -> int:
     Returns:
         The exit code.
     """
-    words = list(sys.argv[1:] if words is None else words)
+    # A lone "-" is standard input, not an option without a name.
+    words = ["stdin" if word == "-" else word for word in (sys.argv[1:] if words is None else words)]
     logging.basicConfig(
         level=os.environ.get("TRILITENET_LOG", "WARNING").upper(),
         format="%(levelname)s %(name)s: %(message)s",
@@ -179,10 +180,11 @@ def _check_command(words: Sequence[str]) -> None:
 
 def _one_line(error: CycloptsError) -> str:
     """Return the message as one line, and how to get help."""
-    if isinstance(error, UnknownOptionError) and error.token.keyword:
+    if isinstance(error, UnknownOptionError):
+        option = (error.token.keyword or error.token.value).partition("=")[0]
         known = [name for argument in error.argument_collection if argument.parse for name in argument.names]
-        near = did_you_mean(error.token.keyword, known)
-        text = f"unknown option {error.token.keyword}" + (near if near.endswith("?") else "")
+        near = did_you_mean(option, known)
+        text = f"unknown option {option}" + (near if near.endswith("?") else "")
     elif isinstance(error, UnusedCliTokensError):
         text = f"unexpected {' '.join(error.unused_tokens or ())}"
     else:

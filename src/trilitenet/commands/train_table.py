@@ -1,0 +1,121 @@
+"""Train every row of a table of the paper, and print the table as the paper does."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from trilitenet.commands.train import train
+from trilitenet.engine.train import CHECKPOINT_NAME
+from trilitenet.errors import ConfigError
+from trilitenet.models.cost import count_multiply_adds, count_parameters
+from trilitenet.models.weights import load_network
+
+__all__ = ["TableResult", "TableRow", "train_table"]
+
+_FIGURES: Final = ("detection/recall", "detection/ap50", "drivable/miou", "lane/accuracy", "lane/iou")
+_HEADINGS: Final = ("Recall (%)", "mAP@0.5 (%)", "Drivable mIoU (%)", "Lane Acc (%)", "Lane IoU (%)")
+
+
+@dataclasses.dataclass(frozen=True)
+class TableRow:
+    """One trained network.
+
+    Attributes:
+        name: Of the row.
+        figures: Figures of the last validation, by name, in [0, 1]; a task it lacks is left out.
+        parameters: Number of parameters.
+        multiply_adds: For one input.
+    """
+
+    name: str
+    figures: dict[str, float]
+    parameters: int
+    multiply_adds: int
+
+
+@dataclasses.dataclass(frozen=True)
+class TableResult:
+    """A table.
+
+    Attributes:
+        title: Of the table.
+        rows: In the paper's order.
+        finished: False if a run was stopped; its row and those after it are missing.
+    """
+
+    title: str
+    rows: tuple[TableRow, ...]
+    finished: bool
+
+    @property
+    def exit_code(self) -> int:
+        """0 if every row is there, 130 if a run was stopped."""
+        return 0 if self.finished else 130
+
+    def summary(self) -> str:
+        """Return the table in Markdown."""
+        head = ("Method", *_HEADINGS, "Params (M)", "Multiply-adds (G)")
+        lines = [
+            self.title if self.finished else f"{self.title} (stopped; go on with --resume)",
+            "",
+            _line(head),
+            _line(["---"] * len(head)),
+        ]
+        for row in self.rows:
+            cells = [f"{100 * row.figures[name]:.1f}" if name in row.figures else "-" for name in _FIGURES]
+            cost = (f"{row.parameters / 1e6:.2f}", f"{row.multiply_adds / 1e9:.2f}")
+            lines.append(_line([row.name, *cells, *cost]))
+        return "\n".join(lines)
+
+
+def train_table(table: Path, /, *, data: Path, output: Path, resume: bool = False, settings: str = "") -> TableResult:
+    """Train every row of a table of the paper and print the table; rows that are done are not trained again.
+
+    Args:
+        table: A YAML file with a title and rows: name -> recipe, relative to the file.
+        data: Root folder of a data set in the published layout.
+        output: Folder of the runs, a folder each.
+        resume: Go on with a row that was stopped; otherwise it starts anew.
+        settings: Settings of every run that replace the recipes', in YAML: '{epochs: 10, workers: 4}'.
+
+    Returns:
+        The table.
+    """
+    title, recipes = _read(table)
+    more = yaml.safe_load(settings) if settings else {}
+    if not isinstance(more, dict):
+        raise ConfigError(f"settings must be YAML such as '{{epochs: 10}}', got {settings!r}")
+    rows: list[TableRow] = []
+    for name, recipe in recipes.items():
+        folder = output / recipe.stem
+        weights = folder / "final.safetensors"
+        finished = weights.is_file()
+        if not finished:
+            going_on = resume and (folder / CHECKPOINT_NAME).is_file()
+            fields: dict[str, Any] = {**more, "data": str(data), "output": str(folder)}
+            finished = train(recipe, resume=going_on, overwrite=not going_on, **fields).finished
+        if not finished:
+            break
+        network = load_network(weights)
+        figures = {key.removeprefix("val "): value for key, value in network.card.metrics.items()}
+        rows.append(
+            TableRow(name, figures, count_parameters(network), count_multiply_adds(network, network.card.input_size))
+        )
+    return TableResult(title, tuple(rows), len(rows) == len(recipes))
+
+
+def _read(table: Path) -> tuple[str, dict[str, Path]]:
+    try:
+        content = yaml.safe_load(table.read_text(encoding="utf-8"))
+        rows = {str(name): table.parent / str(recipe) for name, recipe in content["rows"].items()}
+        return str(content["title"]), rows
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(f"{table}: must hold a title and rows of 'name: recipe' ({error!r})") from error
+
+
+def _line(cells: Any) -> str:
+    return "| " + " | ".join(cells) + " |"

@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from trilitenet.config import DEFAULT_ANCHORS
+from trilitenet.data.sample import Sample
+from trilitenet.engine.anchors import best_possible_recall, box_sizes, fit_anchors
+from trilitenet.errors import DataError
+
+
+def wide_boxes(count: int = 600) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    width = np.exp(rng.uniform(np.log(8), np.log(300), count))
+    return np.stack([width, width / 3 * rng.uniform(0.8, 1.2, count)], axis=1)
+
+
+def test_width_comes_first() -> None:
+    fit = fit_anchors(wide_boxes(), DEFAULT_ANCHORS)
+    assert fit.changed
+    assert all(width > 2 * height for level in fit.anchors for width, height in level)
+
+
+def test_fits_better_and_says_so() -> None:
+    boxes = wide_boxes()
+    fit = fit_anchors(boxes, DEFAULT_ANCHORS)
+    flat = np.array(fit.anchors).reshape(-1, 2)
+    assert fit.recall_after == best_possible_recall(boxes, flat) >= fit.recall_before
+    assert fit.fit_after > fit.fit_before
+    assert (np.diff(flat.prod(axis=1)) >= 0).all()
+    assert "best possible recall" in fit.summary()
+
+
+def test_good_anchors_are_kept() -> None:
+    old = fit_anchors(wide_boxes(), DEFAULT_ANCHORS).anchors
+    boxes = np.repeat(np.array(old).reshape(-1, 2), 5, axis=0)
+    fit = fit_anchors(boxes, old)
+    assert fit.anchors == old
+    assert fit.fit_after == pytest.approx(1.0)
+
+
+def test_is_deterministic() -> None:
+    assert fit_anchors(wide_boxes(), DEFAULT_ANCHORS, seed=3) == fit_anchors(wide_boxes(), DEFAULT_ANCHORS, seed=3)
+
+
+def test_too_few_boxes_are_refused() -> None:
+    with pytest.raises(DataError, match="too few"):
+        fit_anchors(wide_boxes(8), DEFAULT_ANCHORS)
+
+
+def test_recall_by_hand() -> None:
+    sizes = np.array([[10.0, 10.0], [39.0, 10.0], [41.0, 10.0]])
+    assert best_possible_recall(sizes, np.array([[10.0, 10.0]])) == pytest.approx(2 / 3)
+
+
+class _Source:
+    class_names = ("vehicle",)
+
+    def __len__(self) -> int:
+        return 2
+
+    def __getitem__(self, index: int) -> Sample:
+        image = np.zeros((720, 1280, 3), np.uint8)
+        if index:
+            return Sample("b", image)
+        return Sample("a", image, np.array([[0, 0, 100, 40]], np.float32), np.zeros(1, np.int64))
+
+    def attributes(self, index: int) -> dict[str, str]:
+        return {}
+
+
+def test_sizes_are_in_input_pixels() -> None:
+    assert box_sizes(_Source(), (384, 640)).tolist() == [[50.0, 20.0]]

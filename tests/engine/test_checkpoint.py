@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from trilitenet.engine.checkpoint import random_state, read_checkpoint, set_random_state, write_checkpoint
+from trilitenet.errors import OutputError, WeightsError
+
+
+def test_state_goes_round(tmp_path: Path) -> None:
+    path = tmp_path / "run" / "last.ckpt"
+    write_checkpoint(path, {"step": 3, "network": {"w": torch.arange(3)}})
+    state = read_checkpoint(path)
+    assert state["step"] == 3
+    assert state["network"]["w"].tolist() == [0, 1, 2]
+    assert [file.name for file in path.parent.iterdir()] == ["last.ckpt"]
+
+
+def test_random_states_go_round(tmp_path: Path) -> None:
+    write_checkpoint(tmp_path / "c", {"random": random_state()})
+
+    def draw() -> list[float]:
+        return [float(torch.rand(())), float(np.random.rand()), random.random()]  # noqa: NPY002
+
+    first = draw()
+    set_random_state(read_checkpoint(tmp_path / "c")["random"])
+    assert draw() == first
+
+
+def test_killed_in_the_middle_of_writing_leaves_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "last.ckpt"
+    write_checkpoint(path, {"step": 1})
+    script = f"""
+import os, signal, torch
+from trilitenet.engine import checkpoint
+def half(state, file):
+    file.write(b"PK half a file"); file.flush()
+    os.kill(os.getpid(), signal.SIGKILL)
+torch.save = half
+checkpoint.write_checkpoint({str(path)!r}, {{"step": 2}})
+"""
+    done = subprocess.run([sys.executable, "-c", script], check=False, timeout=120)
+    assert done.returncode == -9
+    assert read_checkpoint(path)["step"] == 1
+    write_checkpoint(path, {"step": 3})
+    assert read_checkpoint(path)["step"] == 3
+
+
+@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 cut"])
+def test_a_damaged_file_is_named(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "bad.ckpt"
+    path.write_bytes(content)
+    with pytest.raises(WeightsError, match=r"bad\.ckpt: is not a checkpoint"):
+        read_checkpoint(path)
+
+
+def test_a_missing_file_and_a_newer_layout_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match="no such checkpoint"):
+        read_checkpoint(tmp_path / "none.ckpt")
+    torch.save({"schema": 99}, tmp_path / "new.ckpt")
+    with pytest.raises(WeightsError, match="newer than this version"):
+        read_checkpoint(tmp_path / "new.ckpt")
+
+
+def test_code_in_a_file_is_not_run(tmp_path: Path) -> None:
+    class Evil:
+        def __reduce__(self) -> tuple[object, tuple[str]]:
+            return (Path.touch, (str(tmp_path / "ran"),))
+
+    torch.save({"schema": 1, "x": Evil()}, tmp_path / "evil.ckpt")
+    with pytest.raises(WeightsError, match="is not a checkpoint"):
+        read_checkpoint(tmp_path / "evil.ckpt")
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_place_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot write the checkpoint"):
+        write_checkpoint(tmp_path / "file" / "last.ckpt", {})

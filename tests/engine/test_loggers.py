@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from trilitenet.engine.loggers import CsvLogger, build_loggers, read_csv
+from trilitenet.errors import MissingExtraError
+
+
+def test_csv_goes_on_without_what_came_after(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.csv"
+    logger = CsvLogger(path)
+    for step in range(1, 5):
+        logger.log({"loss": step / 3}, step)
+    logger.close()
+    logger = CsvLogger(path, step=2)
+    logger.log({"loss": 9.0}, 3)
+    logger.close()
+    assert read_csv(path) == [(1, "loss", 1 / 3), (2, "loss", 2 / 3), (3, "loss", 9.0)]
+
+
+def test_a_new_run_starts_the_file_anew(tmp_path: Path) -> None:
+    for _ in range(2):
+        logger = CsvLogger(tmp_path / "m.csv")
+        logger.log({"a": 1}, 1)
+        logger.close()
+    assert len(read_csv(tmp_path / "m.csv")) == 1
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_tensorboard_writes_events(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    (logger,) = build_loggers(["tensorboard", "tensorboard"], tmp_path, {})
+    logger.log({"train/total": 1.0}, 1)
+    logger.close()
+    assert list((tmp_path / "tensorboard").glob("events.*"))
+
+
+@pytest.mark.parametrize("name", ["mlflow", "wandb"])
+def test_a_missing_package_names_its_extra(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(MissingExtraError, match=rf"trilitenet\[{name}\]"):
+        build_loggers([name], tmp_path, {})
+
+
+def test_mlflow_and_wandb_are_told_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[object] = []
+
+    class Fake:
+        def init(self, **settings: object) -> Fake:
+            told.append(settings["config"])
+            return self
+
+        def start_run(self, run_name: str) -> None:
+            told.append(run_name)
+
+        def log_params(self, values: object) -> None:
+            told.append(values)
+
+        def log(self, values: object, step: int) -> None:
+            told.append((values, step))
+
+        log_metrics = log
+
+        def finish(self) -> None:
+            told.append("end")
+
+        end_run = finish
+
+    monkeypatch.setitem(sys.modules, "mlflow", Fake())
+    monkeypatch.setitem(sys.modules, "wandb", Fake())
+    for logger in build_loggers(["mlflow", "wandb"], tmp_path / "run", {"lr": 1}):
+        logger.log({"loss": 2.0}, 5)
+        logger.close()
+    assert told == ["run", {"lr": "1"}, {"lr": 1}, ({"loss": 2.0}, 5), "end", ({"loss": 2.0}, 5), "end"]

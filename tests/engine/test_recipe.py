@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from trilitenet.engine.recipe import TrainConfig, merge, read_recipe
+from trilitenet.errors import ConfigError
+
+
+def test_file_then_overrides(tmp_path: Path) -> None:
+    path = tmp_path / "r.yaml"
+    path.write_text("variant: small\nlr: 1e-2\naugmentation: {rotation: 3, flip: 0}\n")
+    config = read_recipe(path, {"lr": 0.5, "augmentation": {"flip": 0.25}})
+    assert (config.variant, config.lr) == ("small", 0.5)
+    assert (config.augmentation.rotation, config.augmentation.flip) == (3.0, 0.25)
+    assert read_recipe(path).lr == 0.01
+
+
+def test_base_is_relative_and_laid_under(tmp_path: Path) -> None:
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "a.yaml").write_text("epochs: 7\nvariant: base\n")
+    (tmp_path / "sub" / "b.yaml").write_text("base: ../a.yaml\nvariant: small\n")
+    config = read_recipe(tmp_path / "sub" / "b.yaml")
+    assert (config.epochs, config.variant) == (7, "small")
+
+
+def test_the_resolved_configuration_reads_back(tmp_path: Path) -> None:
+    config = read_recipe(None, {"sampling": {"timeofday": {"night": 2}}, "tasks": ["lane"], "multi_scale": [0.5, 1.5]})
+    (tmp_path / "c.yaml").write_text(yaml.safe_dump(config.to_dict()))
+    assert read_recipe(tmp_path / "c.yaml") == config
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("epoch: 3", r"unknown key 'epoch'; did you mean 'epochs'\?"),
+        ("augmentation: {rotatoin: 1}", "rotatoin"),
+        ("lr: fast", "lr"),
+        ("lr: 0", "lr must be above 0"),
+        ("variant: huge", "unknown variant"),
+        ("epochs: 0", "epochs must be at least 1"),
+        ("batch_size: 10\naccumulate: 4", "not a multiple"),
+        ("ema_decay: 1", "ema_decay"),
+        ("multi_scale: [2, 1]", "multi_scale"),
+        ("patience: -1", "patience"),
+        ("- 1", "must hold 'key: value' lines"),
+        ("a: [", "cannot be read as YAML"),
+        ("base: r.yaml", "its own base"),
+    ],
+)
+def test_a_wrong_recipe_is_named(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "r.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        read_recipe(path)
+
+
+def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.yaml"):
+        read_recipe(tmp_path / "none.yaml")
+
+
+def test_merge_goes_into_mappings() -> None:
+    assert merge({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 4}, "d": {"e": 5}}) == {
+        "a": {"b": 4, "c": 2},
+        "d": {"e": 5},
+    }
+
+
+def test_defaults_are_the_papers() -> None:
+    config = TrainConfig()
+    assert (config.epochs, config.batch_size, config.lr, config.betas) == (200, 16, 0.001, (0.937, 0.999))
+    assert (config.box_gains, config.task_weights) == ((0.05, 1.0, 0.5), (1.0, 0.3, 0.3))
+    assert (config.drivable_tversky, config.lane_tversky, config.focal) == ((0.7, 0.3), (0.9, 0.1), (0.25, 2.0))

@@ -1,0 +1,45 @@
+from __future__ import annotations
+
+import torch
+
+from trilitenet.data.batches import Batch
+from trilitenet.engine.rescale import draw_size, rescale
+
+
+def batch() -> Batch:
+    mask = torch.zeros(1, 64, 128, dtype=torch.uint8)
+    mask[:, 32:, :64] = 1
+    mask[:, :, 120:] = 255
+    return Batch(
+        images=torch.full((1, 3, 64, 128), 77, dtype=torch.uint8),
+        boxes=torch.tensor([[0, 0, 32.0, 48.0, 16.0, 8.0]]),
+        ignored=torch.tensor([[0, 100.0, 10.0, 20.0, 20.0]]),
+        detection_labelled=torch.tensor([True]),
+        drivable=mask,
+        lane=mask,
+        names=("a",),
+    )
+
+
+def test_images_masks_and_boxes_go_together() -> None:
+    small = rescale(batch(), (32, 64))
+    assert small.images.shape == (1, 3, 32, 64)
+    assert small.images.dtype is torch.uint8
+    assert set(small.images.unique().tolist()) == {77}
+    assert small.boxes.tolist() == [[0, 0, 16.0, 24.0, 8.0, 4.0]]
+    assert small.ignored.tolist() == [[0, 50.0, 5.0, 10.0, 10.0]]
+    assert bool((small.drivable[0, 16:, :32] == 1).all())
+    assert set(small.lane.unique().tolist()) == {0, 1, 255}
+
+
+def test_the_same_size_changes_nothing() -> None:
+    whole = batch()
+    assert rescale(whole, (64, 128)) is whole
+
+
+def test_sizes_are_multiples_of_32_and_depend_on_seed_and_step_alone() -> None:
+    sizes = [draw_size((384, 640), (0.5, 1.5), 0, step) for step in range(40)]
+    assert sizes == [draw_size((384, 640), (0.5, 1.5), 0, step) for step in range(40)]
+    assert all(side % 32 == 0 for size in sizes for side in size)
+    assert len(set(sizes)) > 5
+    assert draw_size((384, 640), (1.0, 1.0), 0, 0) == (384, 640)

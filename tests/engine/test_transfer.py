@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from trilitenet.engine.transfer import freeze, initialise, keep_frozen
+from trilitenet.errors import ConfigError
+from trilitenet.models.trilitenet import build_network
+
+
+def test_other_classes_keep_all_but_the_heads() -> None:
+    source, network = build_network("tiny"), build_network("tiny", 3)
+    report = initialise(network, source)
+    assert set(report.misshapen) == {f"detection.convs.{i}.{what}" for i in range(3) for what in ("weight", "bias")}
+    assert (report.missing, report.surplus) == ((), ())
+    torch.testing.assert_close(network.encoder.state_dict(), source.encoder.state_dict())
+    assert "detection.convs.0.weight" in report.summary()
+
+
+def test_a_task_more_and_a_task_less_are_told() -> None:
+    report = initialise(build_network("tiny"), build_network("tiny", tasks=("detection", "drivable")))
+    assert report.missing
+    assert all(name.startswith("lane.") for name in report.missing)
+    report = initialise(build_network("tiny", tasks=("lane",)), build_network("tiny"))
+    assert report.missing == ()
+    assert any(name.startswith("drivable.") for name in report.surplus)
+
+
+def test_nothing_that_fits_is_an_error() -> None:
+    with pytest.raises(ConfigError, match="another variant"):
+        initialise(nn.Linear(2, 2), nn.Conv2d(1, 1, 1))
+
+
+def test_frozen_parts_learn_nothing() -> None:
+    network = build_network("tiny").train()
+    count = freeze(network, ("encoder", "lane.up1"))
+    keep_frozen(network, ("encoder", "lane.up1"))
+    before = {name: value.clone() for name, value in network.encoder.state_dict().items()}
+    out = network(torch.randn(2, 3, 64, 128))
+    out.drivable.square().mean().backward()
+    assert count == sum(p.numel() for p in network.encoder.parameters()) + sum(
+        p.numel() for p in network.get_submodule("lane.up1").parameters()
+    )
+    assert all(parameter.grad is None for parameter in network.encoder.parameters())
+    assert all(parameter.grad is not None for parameter in network.get_submodule("drivable").parameters())
+    torch.testing.assert_close(network.encoder.state_dict(), before)
+
+
+def test_an_unknown_part_is_named() -> None:
+    with pytest.raises(ConfigError, match="did you mean 'encoder'"):
+        freeze(build_network("tiny"), ("encodr",))
