@@ -47,6 +47,11 @@ def test_a_command_is_its_function(greet: list[object], capsys: pytest.CaptureFi
     assert capsys.readouterr().out == "hello Ada\n"
 
 
+def test_a_lone_hyphen_is_standard_input(greet: list[object]) -> None:
+    assert cli.main(["greet", "-"]) == 0
+    assert greet == [("stdin", 1)]
+
+
 def test_a_result_is_shown_and_decides_the_exit_code(greet: list[object], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["greet", "two"]) == 1
     assert capsys.readouterr().out == "1 of 2 greeted\n"
@@ -73,6 +78,7 @@ def test_an_interruption_is_130(greet: list[object]) -> None:
             "error: unknown option --loudnes; did you mean '--loudness'? (see: trilitenet greet --help)\n",
         ),
         (["greet"], 'error: Command "greet" parameter --name requires an argument (see: trilitenet greet --help)\n'),
+        (["greet", "a", "--louder=3"], None),
         (["greet", "a", "1", "2"], None),
         (["greet", "a", "--loudness", "much"], None),
     ],

@@ -301,7 +301,8 @@ class CameraReader(FrameReader):
         self.expected = self.clip.expected(None, None)
 
     def _decode(self) -> Any:
-        camera = cv2.VideoCapture(self._number)
+        with _silent_opencv():
+            camera = cv2.VideoCapture(self._number)
         try:
             if not camera.isOpened():
                 raise InputError(f"{self.name}: there is no such camera, or another program holds it")
@@ -392,7 +393,7 @@ def find_sources(
 
     Args:
         names: Pictures, videos, folders (all the files directly in them, but hidden ones), glob patterns, numbered
-            pictures (``%06d``), URLs, a camera's number, ``-`` for standard input.
+            pictures (``%06d``), URLs, a camera's number, ``-`` or ``stdin`` for standard input.
         clip: Which frames of videos are wanted.
         rate: Frames a second of numbered pictures.
 
@@ -416,7 +417,7 @@ def find_sources(
     for name in dict.fromkeys(map(str, names)):
         if re.match(r"[a-z][a-z0-9+.-]+://", name, re.IGNORECASE):
             add(functools.partial(_open_url, name, clip), name)
-        elif name == "-":
+        elif name == "-" or (name == "stdin" and not Path(name).exists()):
             add(functools.partial(VideoReader, "-", clip), "stdin")
         elif name.isdecimal() and not Path(name).exists():
             add(functools.partial(CameraReader, int(name), clip), name)
@@ -475,6 +476,16 @@ def _expand(name: str) -> list[Path]:
     else:
         raise InputError(f"{name}: no such file or folder")
     return sorted(files, key=lambda file: [int(t) if t.isdecimal() else t for t in re.split(r"(\d+)", str(file))])
+
+
+@contextlib.contextmanager
+def _silent_opencv() -> Iterator[None]:
+    """Keep OpenCV from printing: what it has to say is raised."""
+    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(before)
 
 
 def _av() -> Any:
