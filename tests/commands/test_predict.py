@@ -260,7 +260,11 @@ def test_ctrl_c_on_the_command_line(tmp_path: Path, weights: Path) -> None:
     source, output = drive(tmp_path / "drive.mp4", frames=600), tmp_path / "out"
     words = ["predict", str(source), "--output", str(output), "--model", str(weights), "--device", "cpu"]
     with subprocess.Popen(
-        [sys.executable, "-m", "trilitenet", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "trilitenet", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background job ignores it
     ) as process:
         for _ in range(600):
             if process.poll() is not None or (output / "drive.mp4.part").exists():
