@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -113,15 +114,16 @@ class Running:
 
     def __init__(self, app: Application) -> None:
         self.app = app
-        self.server: GuardedServer = build_server(app, "127.0.0.1", 0)
-        self._thread = threading.Thread(target=self.server.run, daemon=True)
+        self.server: GuardedServer = build_server(app)
+        listener = socket.create_server(("127.0.0.1", 0), backlog=1024)
+        self.port: int = listener.getsockname()[1]
+        self._thread = threading.Thread(target=self.server.run, args=([listener],), daemon=True)
         self._thread.start()
         until = time.monotonic() + 20
         while not self.server.started:
             assert self._thread.is_alive(), "the server did not start"
             assert time.monotonic() < until, "the server did not start in time"
             time.sleep(0.01)
-        self.port: int = self.server.servers[0].sockets[0].getsockname()[1]
         self.url = f"http://127.0.0.1:{self.port}"
 
     def stop(self, timeout: float = 20) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import sys
 from pathlib import Path
 
@@ -52,7 +53,7 @@ def serve(
         log_level: What is logged: debug, info, warning or error.
 
     Raises:
-        ConfigError: If a limit is out of range, or the token too short.
+        ConfigError: If a limit is out of range, the token too short, or the port taken.
         MissingExtraError: If the extra "serve" is not installed.
     """
     for module in ("fastapi", "uvicorn", "httptools", "prometheus_client"):
@@ -77,13 +78,25 @@ def serve(
         drain=drain,
         token=_read_token(token_file),
     )
+    listener = _listen(host, port)
     set_up_logs(log_level.upper())
     cv2.setNumThreads(1)  # images are the unit of parallel work here
     # The network's thread takes Python's lock often and briefly; with the usual 5 ms each other thread delays it.
     sys.setswitchinterval(0.0005)
     predictor = load(model, device=device, backend=backend, confidence=confidence)
     with predictor:
-        build_server(create_app(predictor, Path(model).stem, settings), host, port).run()
+        build_server(create_app(predictor, Path(model).stem, settings)).run([listener])
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    """Return a listening socket: a port that is taken is told before the model is loaded."""
+    try:
+        return socket.create_server(
+            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET, backlog=1024
+        )
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigError(f"cannot listen on {host} port {port} ({reason}); choose with --host and --port") from error
 
 
 def _read_token(file: Path | None) -> str | None:

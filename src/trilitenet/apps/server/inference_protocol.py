@@ -8,7 +8,6 @@ protocol's binary form.
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import binascii
 import json
@@ -86,8 +85,7 @@ def protocol_router(service: Service) -> APIRouter:
             query = await service.in_pool(_parse, body, split, names, service.settings)
             reservation.take(len(query.images) * query.size[0] * query.size[1] * BYTES_PER_PIXEL)
             with service.admit(len(query.images)) as deadline:
-                jobs = [service.see(image, deadline, _perception) for image in query.images]
-                perceptions = await until_vanished(request, asyncio.gather(*jobs))
+                perceptions = await until_vanished(request, service.see_all(query.images, deadline, _perception))
             return await service.in_pool(_answer, service.name, query, perceptions)
 
     return router

@@ -20,6 +20,8 @@ from trilitenet.apps.server.settings import Settings
 
 __all__ = ["GuardedProtocol", "GuardedServer", "JsonFormatter", "build_server", "set_up_logs"]
 
+logger = logging.getLogger("trilitenet.server")
+
 _MAX_HEADERS: Final = 32 * 1024
 """Bytes of a request's first line and headers."""
 
@@ -143,6 +145,13 @@ class GuardedServer(uvicorn.Server):
         super().__init__(config)
         self._application = application
 
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start, and say where."""
+        await super().startup(sockets)
+        for listener in sockets or []:
+            host, port = listener.getsockname()[:2]
+            logger.info("listening", extra={"url": f"http://{f'[{host}]' if ':' in host else host}:{port}/"})
+
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Drain, then stop."""
         service = self._application.service
@@ -153,20 +162,16 @@ class GuardedServer(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def build_server(application: Application, host: str, port: int) -> GuardedServer:
-    """Build the server of a process.
+def build_server(application: Application) -> GuardedServer:
+    """Build the server of a process; its ``run`` takes the listening sockets.
 
     Args:
         application: What `create_app` made.
-        host: Address to listen on.
-        port: Port to listen on; 0 takes a free one.
     """
     settings = application.service.settings
     protocol = type("Protocol", (GuardedProtocol,), {"limits": settings})
     config = Config(
         application,
-        host=host,
-        port=port,
         http=protocol,
         ws="none",
         lifespan="on",

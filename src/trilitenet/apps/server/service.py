@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -165,6 +165,20 @@ class Service:
             )
         except asyncio.TimeoutError:
             raise _too_late() from None
+
+    async def see_all(
+        self,
+        images: Sequence[Encoded | NDArray[np.uint8]],
+        deadline: float,
+        finish: Callable[[Outcome], _T],
+    ) -> list[_T]:
+        """Take several admitted images through all stages; the first failure ends them all."""
+        tasks = [asyncio.ensure_future(self.see(image, deadline, finish)) for image in images]
+        try:
+            return list(await asyncio.gather(*tasks))
+        finally:
+            for task in tasks:
+                task.cancel()
 
     async def _stages(
         self,

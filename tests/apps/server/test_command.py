@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+import socket
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.apps.server.conftest import TOKEN, FakeBackend
+from trilitenet.apps import cli
+from trilitenet.apps.server import command
+from trilitenet.apps.server.process import GuardedServer
+from trilitenet.apps.server.settings import Settings
+from trilitenet.errors import ConfigError
+from trilitenet.inference.predictor import Predictor
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch, backend: FakeBackend) -> Iterator[list[Any]]:
+    """Stop short of serving; the list takes the servers that would have run."""
+    servers: list[Any] = []
+
+    def run(self: GuardedServer, sockets: list[socket.socket]) -> None:
+        servers.append(self)
+        for one in sockets:
+            one.close()
+
+    monkeypatch.setattr("trilitenet.commands.load.load", lambda model, **options: Predictor(backend))
+    monkeypatch.setattr("trilitenet.apps.server.process.set_up_logs", lambda level: None)
+    monkeypatch.setattr(GuardedServer, "run", run)
+    monkeypatch.delenv("TRILITENET_TOKEN", raising=False)
+    interval = sys.getswitchinterval()
+    yield servers
+    sys.setswitchinterval(interval)
+
+
+def _settings(server: Any) -> Settings:
+    settings: Settings = server.config.app.service.settings
+    return settings
+
+
+def test_flags_become_settings(started: list[Any], backend: FakeBackend) -> None:
+    assert cli.main(["serve", "--model", "runs/my.onnx", "--port", "0", "--queue", "5", "--deadline", "2"]) == 0
+    (server,) = started
+    assert (_settings(server).queue, _settings(server).max_images, _settings(server).deadline) == (5, 5, 2.0)
+    assert server.config.app.service.name == "my"
+    assert backend.closed
+
+
+def test_the_token_comes_from_a_file_or_the_environment(
+    started: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "token"
+    file.write_text(f"{TOKEN}\n")
+    command.serve(port=0, token_file=file)
+    monkeypatch.setenv("TRILITENET_TOKEN", TOKEN[::-1])
+    command.serve(port=0)
+    assert [_settings(server).token for server in started] == [TOKEN, TOKEN[::-1]]
+    assert TOKEN not in repr(_settings(started[0]))
+
+
+def test_mistakes_are_told_in_one_line(started: list[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    short = tmp_path / "short"
+    short.write_text("secret")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        for words, message in (
+            (["--log-level", "loud"], "log_level must be debug"),
+            (["--token-file", str(tmp_path / "none")], "cannot be read"),
+            (["--token-file", str(short)], "at least 16 characters"),
+            (["--queue", "0"], "queue must be at least 1"),
+            (["--deadline", "-1"], "deadline must be positive"),
+            (["--port", port], "cannot listen on 127.0.0.1 port"),
+            (["--port", "99999"], "cannot listen"),
+        ):
+            assert cli.main(["serve", *words]) == 1
+            error = capsys.readouterr().err
+            assert error.startswith("error: ")
+            assert error.count("\n") == 1
+            assert message in error
+            assert "secret" not in error
+    assert started == []
+
+
+def test_settings_must_fit_each_other() -> None:
+    with pytest.raises(ConfigError, match="max_images"):
+        Settings(queue=4, max_images=5)
