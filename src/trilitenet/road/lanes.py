@@ -288,7 +288,7 @@ def _same(line: LaneLine, other: LaneLine, scale: float) -> bool:
     if low - high < 4 * scale:
         return False
     rows = np.linspace(low, high, 5)
-    slope = abs(line.origin[1]) and abs(float(line.column(high) - line.column(low))) / max(low - high, 1.0)
+    slope = abs(float(line.column(high) - line.column(low))) / (low - high)
     apart = np.abs(line.column(rows) - other.column(rows)) / math.sqrt(1 + slope * slope)
     share = (low - high) / max(1.0, min(-line.origin[1], -other.origin[1]))
     near = 6.0 * scale + 0.035 * np.maximum(0.0, rows - high)
