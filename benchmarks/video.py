@@ -38,10 +38,10 @@ def pure_inference(predictor: Predictor, batch: np.ndarray, frames: int) -> floa
     return -(-frames // len(batch)) * len(batch) / (time.perf_counter() - began)
 
 
-def pipeline(predictor: Predictor, video: Path, frames: int, formats: tuple[str, ...]) -> float:
+def pipeline(predictor: Predictor, video: Path, frames: int, overlay: bool) -> float:
     """Return frames a second from file to file."""
     with tempfile.TemporaryDirectory() as folder:
-        report = predict_with(predictor, [video], Path(folder), clip=Clip(max_frames=frames), format=formats)
+        report = predict_with(predictor, [video], Path(folder), clip=Clip(max_frames=frames), overlay=overlay)
     return report.frames / report.seconds
 
 
@@ -92,6 +92,7 @@ def main() -> None:
     parser.add_argument("--batch-size", type=int, default=4)
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--overlay", action=argparse.BooleanOptionalAction, default=True)
     options = parser.parse_args()
     predictor = trilitenet.load(
         options.model, device=options.device, backend=options.backend, batch_size=options.batch_size
@@ -102,7 +103,7 @@ def main() -> None:
     rounds = []
     for _ in range(options.rounds):
         alone = pure_inference(predictor, batch, options.frames)
-        rounds.append((alone, pipeline(predictor, options.video, options.frames, ("json",))))
+        rounds.append((alone, pipeline(predictor, options.video, options.frames, options.overlay)))
     print(f"machine: {platform.processor() or platform.machine()}, {os.cpu_count()} cores; {predictor.backend.name}")
     for alone, whole in rounds:
         print(f"pure inference {alone:7.1f} frames/s   pipeline {whole:7.1f} frames/s   ratio {whole / alone:.2f}")

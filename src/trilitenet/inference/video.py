@@ -195,7 +195,7 @@ class VideoWriter:
     """
 
     def __init__(
-        self, path: Path, rate: float | None = None, *, quality: int = 23, preset: str = "veryfast", ahead: int = 8
+        self, path: Path, rate: float | None = None, *, quality: int = 23, preset: str = "superfast", ahead: int = 8
     ) -> None:
         self._av = import_extra("av", "video")
         self.path = path
