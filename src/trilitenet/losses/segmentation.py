@@ -122,8 +122,9 @@ class SegmentationLoss(nn.Module):
 class _Sums(torch.autograd.Function):
     """The five sums over pixels that both losses are made of, with their gradient in closed form.
 
-    One pass over the pixels, an image at a time on a CPU so that it stays in the cache. (5,): the focal loss, the soft
-    foreground on foreground pixels, the soft foreground on background pixels, foreground and background pixels.
+    (5,): the focal loss, the soft foreground on foreground pixels, the soft foreground on background pixels, and the
+    number of foreground and background pixels. On a CPU the images are taken one at a time, in place, so that they stay
+    in the cache.
     """
 
     @staticmethod
@@ -133,29 +134,29 @@ class _Sums(torch.autograd.Function):
         # Gradients by the logits: of the focal sum, and of the soft foreground by the difference of the logits.
         of_focal = torch.empty_like(logits)
         of_soft = torch.empty_like(target, dtype=logits.dtype)
-        step = 1 if logits.device.type == "cpu" else len(logits)
-        for first in range(0, len(logits), step):
-            part = slice(first, first + step)
+        for part in _parts(target):
             labels = target[part]
             foreground = (labels == 1).to(dtype)
             weight = (labels != IGNORED).to(dtype)
-            background = weight - foreground
-            planes = [logits[part, channel].to(dtype) for channel in (0, 1)]
-            for channel, truth in enumerate((background, foreground)):
-                sign = 2 * truth - 1
-                x = planes[channel] * sign  # the logit of what is true
-                log_p = F.logsigmoid(x)
-                p = log_p.exp()
-                miss = 1 - p
-                factor = (miss if gamma == 1 else miss.pow(gamma)) * ((2 * alpha - 1) * truth + (1 - alpha)) * weight
-                sums[0] -= (factor * log_p).sum()
-                of_focal[part, channel] = factor.mul_(p.mul_(log_p).mul_(gamma).sub_(miss)).mul_(sign)
-            soft = (planes[1] - planes[0]).sigmoid_()
-            sums[1] += (soft * foreground).sum()
-            sums[2] += (soft * background).sum()
-            sums[3] += foreground.sum()
-            sums[4] += background.sum()
+            sign = 2 * foreground - 1
+            background, first = (logits[part, channel].to(dtype, copy=True) for channel in (0, 1))
+            soft = (first - background).sigmoid_()
+            soft_sum = (soft * weight).sum()
+            sums[1] += (on_foreground := (soft * foreground).sum())
+            sums[2] += soft_sum - on_foreground
+            sums[3] += (pixels := foreground.sum())
+            sums[4] += weight.sum() - pixels
             of_soft[part] = soft.addcmul_(soft, soft, value=-1)
+            # The background's truth is the opposite of the foreground's: so are its sign and its balance.
+            for channel, x in enumerate((background.mul_(sign).neg_(), first.mul_(sign))):
+                on, off = (alpha, 1 - alpha) if channel else (1 - alpha, alpha)
+                log_p = F.logsigmoid(x)
+                p = torch.exp(log_p, out=x)
+                miss = 1 - p
+                factor = miss.pow(gamma).mul_((foreground * (on - off)).add_(off).mul_(weight))
+                sums[0] -= torch.dot(factor.view(-1), log_p.view(-1))
+                slope = p.mul_(log_p).mul_(gamma).sub_(miss).mul_(factor).mul_(sign)
+                of_focal[part, channel] = slope if channel else slope.neg_()
         ctx.save_for_backward(of_focal, of_soft, target)
         return sums
 
@@ -165,12 +166,18 @@ class _Sums(torch.autograd.Function):
         of_focal, of_soft, target = ctx.saved_tensors
         focal, hit, wrong = grad[:3].to(of_focal.dtype).unbind()
         result = torch.empty_like(of_focal)
-        step = 1 if result.device.type == "cpu" else len(result)
-        for first in range(0, len(result), step):
-            part = slice(first, first + step)
+        for part in _parts(target):
             labels = target[part]
-            by_label = (labels == 1).to(result.dtype) * (hit - wrong) + (labels != IGNORED).to(result.dtype) * wrong
-            soft = by_label.mul_(of_soft[part])
-            torch.sub(of_focal[part, 0] * focal, soft, out=result[part, 0])
-            torch.add(of_focal[part, 1] * focal, soft, out=result[part, 1])
+            weight = (labels != IGNORED).to(result.dtype).mul_(wrong)
+            soft = (labels == 1).to(result.dtype).mul_(hit - wrong).add_(weight).mul_(of_soft[part])
+            for channel in (0, 1):
+                slope = of_focal[part, channel] * focal
+                result[part, channel] = slope.add_(soft, alpha=1 if channel else -1)
         return result, None, None, None
+
+
+def _parts(target: Tensor) -> list[slice]:
+    """Cut (B, H, W) into what is worked on at once: an image on a CPU, everything elsewhere."""
+    if target.device.type != "cpu":
+        return [slice(None)]
+    return [slice(image, image + 1) for image in range(len(target))]
