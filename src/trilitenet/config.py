@@ -16,6 +16,9 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from trilitenet.errors import ConfigError, WeightsError, did_you_mean
 
 __all__ = [
+    "ARTEFACT_KEY",
+    "ARTEFACT_SCHEMA",
+    "CARD_KEY",
     "CARD_SCHEMA",
     "DEFAULT_ANCHORS",
     "IMAGE_MEAN",
@@ -26,6 +29,7 @@ __all__ = [
     "TASKS",
     "VARIANTS",
     "Anchors",
+    "ArtefactInfo",
     "ModelCard",
     "Task",
     "Thresholds",
@@ -211,6 +215,73 @@ class ModelCard:
         if not isinstance(schema, int) or schema > CARD_SCHEMA:
             raise WeightsError(
                 f"{source}: card schema {schema!r} is newer than {CARD_SCHEMA}, which this version reads; "
+                "upgrade trilitenet"
+            )
+        try:
+            return parse(cls, mapping, source)
+        except ConfigError as error:
+            raise WeightsError(str(error)) from error
+
+
+CARD_KEY: Final = "trilitenet.card"
+"""Key of the card in a file's metadata."""
+ARTEFACT_KEY: Final = "trilitenet.artefact"
+"""Key of the artefact's description in an exported file's metadata."""
+ARTEFACT_SCHEMA: Final = 1
+"""Version of the artefact's description; a file with a higher one is refused."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ArtefactInfo:
+    """How an exported artefact takes pixels and returns results; what the network is stands in its card.
+
+    Attributes:
+        format: ``"onnx"``, ``"openvino"``, ``"tensorrt"`` or ``"torch"``.
+        precision: ``"fp32"``, ``"fp16"``, ``"bf16"`` or ``"int8"``.
+        size: (height, width) of the input in pixels; None if any multiples of 32 will do.
+        input: ``"uint8_nhwc"``: (B, H, W, 3) uint8, or ``"float_nchw"``: (B, 3, H, W) float32 of 0 .. 255. B is 1.
+        colour: ``"rgb"`` or ``"bgr"``.
+        masks: ``"decision"`` (0 or 1), ``"probability"`` (x 255), or ``"logit"`` (foreground where above 0).
+        mask_scale: Mask pixels an input pixel, along an axis.
+        nms: Whether detections have been through non-maximum suppression.
+        trilitenet: Version of the package that wrote it.
+        schema: Version of this layout.
+    """
+
+    format: str
+    precision: Literal["fp32", "fp16", "bf16", "int8"] = "fp32"
+    size: tuple[int, int] | None = None
+    input: Literal["uint8_nhwc", "float_nchw"] = "uint8_nhwc"
+    colour: Literal["rgb", "bgr"] = "rgb"
+    masks: Literal["decision", "probability", "logit"] = "decision"
+    mask_scale: int = 1
+    nms: bool = False
+    trilitenet: str = ""
+    schema: int = ARTEFACT_SCHEMA
+
+    def to_json(self) -> str:
+        """Return the description as one line of JSON."""
+        return json.dumps(dataclasses.asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str, source: str) -> ArtefactInfo:
+        """Read a description.
+
+        Args:
+            text: What `to_json` wrote.
+            source: The file it came from, for messages.
+
+        Raises:
+            WeightsError: If it is not one, or of a newer layout.
+        """
+        try:
+            mapping = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise WeightsError(f"{source}: its description is not JSON ({error})") from error
+        schema = mapping.get("schema") if isinstance(mapping, dict) else None
+        if not isinstance(schema, int) or schema > ARTEFACT_SCHEMA:
+            raise WeightsError(
+                f"{source}: artefact schema {schema!r} is newer than {ARTEFACT_SCHEMA}, which this version reads; "
                 "upgrade trilitenet"
             )
         try:

@@ -54,6 +54,7 @@ def write_triton_repository(
     max_batch: int = 8,
     delay: float = 0.002,
     gpu: bool = False,
+    overwrite: bool = False,
 ) -> Path:
     """Write a model repository that ``tritonserver --model-repository FOLDER`` serves.
 
@@ -65,6 +66,7 @@ def write_triton_repository(
         max_batch: The largest batch, where the artefact takes any.
         delay: Seconds that Triton may wait to fill a batch.
         gpu: Run on GPUs.
+        overwrite: Replace the model if it is there already.
 
     Returns:
         The model's folder.
@@ -80,11 +82,11 @@ def write_triton_repository(
         raise ConfigError(f"{artefact}: a Triton repository is made of .onnx or .xml files; export one first")
     inputs, outputs = read_tensors(artefact)
     model = Path(folder) / (name or f"trilitenet_{card.variant}")
-    if model.exists():
-        raise OutputError(f"{model} exists already; remove it or choose another name")
+    if model.exists() and not overwrite:
+        raise OutputError(f"{model}: exists already; give another --output or --overwrite")
     backend, file_name = _BACKENDS[artefact.suffix]
     version = model / "1"
-    version.mkdir(parents=True)
+    version.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(artefact, version / file_name)
     for companion, target in _companions(artefact):
         shutil.copyfile(companion, version / target)

@@ -167,7 +167,8 @@ class Letterbox:
         """Bring a probability mask from the canvas back to the source: padding cropped, bilinear interpolation.
 
         Args:
-            mask: (canvas height, canvas width) uint8, probability x 255.
+            mask: (canvas height, canvas width) uint8, probability x 255; or of a whole multiple of that size, where a
+                backend enlarges masks itself.
 
         Returns:
             (height, width) uint8 of the source size, probability x 255.
@@ -175,10 +176,12 @@ class Letterbox:
         Raises:
             ShapeError: If the mask is of another size or type.
         """
-        if mask.shape != self.canvas or mask.dtype != np.uint8:
+        scale = mask.shape[0] // self.canvas[0]
+        if scale < 1 or mask.shape != (scale * self.canvas[0], scale * self.canvas[1]) or mask.dtype != np.uint8:
             raise ShapeError(f"mask must be {self.canvas} uint8, got {mask.shape} {mask.dtype}")
-        inside: NDArray[np.uint8] = mask[self.inside]
-        if self.resized == self.source:
+        rows, columns = (slice(scale * part.start, scale * part.stop) for part in self.inside)
+        inside: NDArray[np.uint8] = mask[rows, columns]
+        if inside.shape == self.source:
             return np.array(inside)
         return np.asarray(cv2.resize(inside, self.source[::-1], interpolation=cv2.INTER_LINEAR), np.uint8)
 

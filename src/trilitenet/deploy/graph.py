@@ -1,0 +1,459 @@
+"""The deploy graph: the same function as a network, laid out for speed.
+
+Pixels go in as they are, uint8 and channels-last; boxes come out decoded and masks decided. Everything between is the
+network after the exact rewrites of `trilitenet.deploy.rewrites`: no batch normalisation, no pooling of the image, no
+sums inside ESP blocks, no transposed convolution (where the layout is channels-last).
+"""
+
+from __future__ import annotations
+
+from typing import Final, Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812
+
+from trilitenet.config import STRIDES, Thresholds
+from trilitenet.deploy.layers import (
+    Activation,
+    DepthwiseESPGraph,
+    FusedConv,
+    FusedTransposedConv,
+    Layout,
+    SeparableGraph,
+    StrideESPGraph,
+    constant,
+    depth_to_space,
+    fold_block,
+)
+from trilitenet.deploy.rewrites import (
+    compose_pointwise,
+    conv_kernel,
+    fold_attention,
+    fold_normalisation,
+    mask_difference,
+    merge_pool_into_stem,
+    nest_blocks,
+    pad_inputs,
+    pool_kernel,
+    prelu_slopes,
+    reverse_inputs,
+    space_to_depth_kernel,
+    split_inputs,
+    transposed_as_pointwise,
+    upsample_kernel,
+)
+from trilitenet.errors import ConfigError, ShapeError
+from trilitenet.models.attention import BINS, PCAA
+from trilitenet.models.detection import DetectionHead, LitePAN
+from trilitenet.models.segmentation import SegmentationHead, UpStage
+from trilitenet.models.trilitenet import TriLiteNet
+
+__all__ = ["MASKS", "DeployGraph", "DeployOutputs", "Masks"]
+
+Masks = Literal["decision", "probability", "logit"]
+"""What a mask holds: 0 or 1, probability x 255, or foreground minus background logit minus the threshold's."""
+MASKS: Final[tuple[Masks, ...]] = ("decision", "probability", "logit")
+
+
+class DeployOutputs(NamedTuple):
+    """What the deploy graph returns; None for a task the network lacks.
+
+    Attributes:
+        detection: (B, N, 5 + classes) float32: centre x, centre y, width, height in input pixels, objectness, class
+            probabilities; levels 1/8, 1/16, 1/32 in turn, within a level by row, column, anchor.
+        drivable: (B, scale x H, scale x W), uint8 or float32, see `Masks`.
+        lane: Likewise.
+    """
+
+    detection: Tensor | None
+    drivable: Tensor | None
+    lane: Tensor | None
+
+
+class AttentionGraph(nn.Module):
+    """PCAA as batched matrix products over (bins, pixels of a bin, C), see `fold_attention`."""
+
+    def __init__(self, pcaa: PCAA, layout: Layout) -> None:
+        super().__init__()
+        weights = fold_attention(pcaa)
+        self.channels_last = layout.channels_last
+        self.maps = constant(weights.maps)
+        self.maps_transposed = constant(weights.maps.T)
+        self.maps_bias = constant(weights.maps_bias)
+        self.nodes = constant(weights.nodes)
+        self.nodes_slopes = constant(weights.nodes_slopes)
+        self.key = constant(weights.key)
+        self.key_bias = constant(weights.key_bias.unsqueeze(1))
+        self.fuse = constant(weights.fuse.unsqueeze(0))
+        self.fuse_bias = weights.fuse_bias
+        self.fuse_slope = weights.fuse_slope
+        self.channels = constant(weights.channels)
+        self.value = constant(weights.value)
+        self.value_bias = constant(weights.value_bias)
+        self.act = Activation(weights.out_slopes, maximum=layout.maximum)
+
+    def split(self, x: Tensor) -> Tensor:
+        """Return (B, C, H, W) as (B, bins, pixels of a bin, C)."""
+        batch, channels, height, width = x.shape
+        rows, columns = BINS
+        if self.channels_last:
+            x = x.permute(0, 2, 3, 1).reshape(batch, rows, height // rows, columns, width // columns, channels)
+            return x.permute(0, 1, 3, 2, 4, 5).reshape(batch, rows * columns, -1, channels)
+        x = x.reshape(batch * channels * rows, height // rows, columns, width // columns).permute(0, 2, 1, 3)
+        return x.reshape(batch, channels, rows * columns, -1).permute(0, 2, 3, 1)
+
+    def merge(self, x: Tensor, height: int, width: int) -> Tensor:
+        """Invert `split`."""
+        batch, _, _, channels = x.shape
+        rows, columns = BINS
+        if self.channels_last:
+            x = x.reshape(batch, rows, columns, height // rows, width // columns, channels)
+            return x.permute(0, 1, 3, 2, 4, 5).reshape(batch, height, width, channels).permute(0, 3, 1, 2)
+        x = x.permute(0, 3, 1, 2).reshape(batch * channels * rows, columns, height // rows, width // columns)
+        return x.permute(0, 2, 1, 3).reshape(batch, channels, height, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Apply the block: (B, C, H, W) -> (B, C, H, W)."""
+        batch, channels, height, width = x.shape
+        bins = BINS[0] * BINS[1]
+        pixels = self.split(x)  # (B, bins, R, C)
+        weights = F.softmax(torch.matmul(self.maps, pixels.transpose(2, 3)), -1)  # (B, bins, K, R)
+        confidence = torch.sigmoid(torch.matmul(pixels.mean(2), self.maps_transposed) + self.maps_bias)
+        local = torch.matmul(weights, pixels) * confidence.unsqueeze(-1)  # (B, bins, K, C)
+        local = torch.matmul(self.nodes, local.reshape(batch, bins, -1)).reshape(batch, bins, channels, channels)
+        local = F.prelu(local, self.nodes_slopes)
+        keys = torch.matmul(local, self.key)
+        bias = torch.matmul(local, self.key_bias).transpose(2, 3)  # (B, bins, 1, K)
+        total = torch.matmul(self.fuse, local.reshape(batch, bins, -1)).reshape(batch, 1, channels, channels)
+        total = F.leaky_relu(torch.matmul(total, self.channels) + self.fuse_bias, self.fuse_slope)
+        values = torch.matmul(total, self.value) + self.value_bias
+        affinity = F.softmax(torch.matmul(pixels, keys.transpose(2, 3)) + bias, -1)  # (B, bins, R, K)
+        return x + self.act(self.merge(torch.matmul(affinity, values), height, width))
+
+
+class DetectionGraph(nn.Module):
+    """SPP, LitePAN, head and decoding: C3, C4, C5 -> (B, N, 5 + classes)."""
+
+    def __init__(self, litepan: LitePAN, spp: nn.Module | None, head: DetectionHead, anchors: Tensor) -> None:
+        super().__init__()
+        laterals = [conv_kernel(conv) for conv in litepan.laterals]  # type: ignore[arg-type]
+        heads = [conv_kernel(conv) for conv in head.convs]  # type: ignore[arg-type]
+        self.reduce = None
+        if spp is not None:
+            self.reduce = FusedConv(conv_kernel(spp.reduce))  # type: ignore[arg-type]
+            laterals[2] = compose_pointwise(conv_kernel(spp.expand), laterals[2])  # type: ignore[arg-type]
+        self.paths = litepan.paths
+        if self.paths:
+            self.top_down = nn.ModuleList(SeparableGraph(block) for block in litepan.top_down)  # type: ignore[arg-type]
+            self.bottom_up = nn.ModuleList(SeparableGraph(block) for block in litepan.bottom_up)  # type: ignore[arg-type]
+            self.smooth = nn.ModuleList(FusedConv(conv_kernel(block.depthwise)) for block in litepan.smooth)  # type: ignore[arg-type, union-attr]
+            heads = [
+                compose_pointwise(conv_kernel(block.pointwise), last)  # type: ignore[arg-type, union-attr]
+                for block, last in zip(litepan.smooth, heads, strict=True)
+            ]
+        else:
+            laterals = [compose_pointwise(lateral, last) for lateral, last in zip(laterals, heads, strict=True)]
+            heads = []
+        self.laterals = nn.ModuleList(FusedConv(kernel) for kernel in laterals)
+        self.heads = nn.ModuleList(FusedConv(kernel) for kernel in heads)
+        self.values = 5 + head.classes
+        # decoded = (a s + b) s + offset, s = sigmoid(logit): xy: 2 stride s; wh: 4 anchor s^2; scores: s.
+        square = torch.zeros(len(STRIDES), anchors.shape[1], self.values)
+        square[:, :, 2:4] = 4 * anchors
+        linear = torch.ones_like(square)
+        linear[:, :, 2:4] = 0
+        linear[:, :, :2] = 2 * torch.tensor(STRIDES).view(-1, 1, 1)
+        self.square = constant(square.flatten(1))
+        self.linear = constant(linear.flatten(1))
+        # What a step to the next column or row adds: stride to x or y.
+        step = torch.zeros(2, len(STRIDES), anchors.shape[1], self.values)
+        for axis in range(2):
+            step[axis, :, :, axis] = torch.tensor(STRIDES).view(-1, 1)
+        self.step = constant(step.flatten(2))
+
+    def forward(self, c3: Tensor, c4: Tensor, c5: Tensor) -> Tensor:
+        """Return decoded detections, see `DeployOutputs`."""
+        if self.reduce is not None:
+            pools = [self.reduce(c5)]
+            for _ in range(3):  # stride-1 pools of 5, 9 and 13 are one, two and three pools of 5
+                pools.append(F.max_pool2d(pools[-1], 5, stride=1, padding=2))
+            c5 = torch.cat(pools, 1)
+        p3, p4, p5 = (lateral(c) for lateral, c in zip(self.laterals, (c3, c4, c5), strict=True))
+        if self.paths:
+            p4 = p4 + F.interpolate(p5, scale_factor=2.0, mode="bilinear", align_corners=False)
+            p3 = p3 + F.interpolate(p4, scale_factor=2.0, mode="bilinear", align_corners=False)
+            p3, p4, p5 = (block(p) for block, p in zip(self.top_down, (p3, p4, p5), strict=True))
+            p4 = self.bottom_up[0](p3, p4)
+            p5 = self.bottom_up[1](p4, p5)
+            p3, p4, p5 = (
+                head(smooth(p)) for head, smooth, p in zip(self.heads, self.smooth, (p3, p4, p5), strict=True)
+            )
+        return torch.cat([self.decode(level, p) for level, p in enumerate((p3, p4, p5))], 1)
+
+    def decode(self, level: int, logits: Tensor) -> Tensor:
+        """Decode one level: (B, anchors x values, h, w) -> (B, h x w x anchors, values)."""
+        batch, _, height, width = logits.shape
+        scores = torch.sigmoid(logits.permute(0, 2, 3, 1))
+        columns = torch.arange(width, dtype=torch.float32, device=logits.device) - 0.5
+        rows = torch.arange(height, dtype=torch.float32, device=logits.device) - 0.5
+        offset = columns.view(1, width, 1) * self.step[0, level] + rows.view(height, 1, 1) * self.step[1, level]
+        decoded = (scores * self.square[level] + self.linear[level]) * scores + offset
+        return decoded.reshape(batch, -1, self.values)
+
+
+class UpStageGraph(nn.Module):
+    """Transposed convolution x2, concatenation with the image, two 3x3 convolutions; see `Layout`.
+
+    Args:
+        stage: The network's.
+        layout: How to lay it out.
+        block: Side of the pixel blocks of its output.
+    """
+
+    def __init__(self, stage: UpStage, layout: Layout, block: int) -> None:
+        super().__init__()
+        slopes = prelu_slopes(stage.up.act, stage.up.deconv.out_channels)
+        self.up: FusedConv | FusedTransposedConv
+        if layout.channels_last or block == 2:
+            kernel = transposed_as_pointwise(stage.up.deconv.weight, stage.up.bn)
+            self.up = FusedConv(kernel, slopes.repeat(4), maximum=layout.maximum)
+            self.unblock = 2 // block
+        else:
+            self.up = FusedTransposedConv(stage.up.deconv, stage.up.bn, slopes, maximum=layout.maximum)
+            self.unblock = 1
+        blocks = (block, block)
+        kernel, slopes = fold_block(stage.conv1)
+        slopes = slopes.repeat(block * block)
+        x, image = split_inputs(kernel, len(kernel.weight), 3)
+        x, image = (space_to_depth_kernel(part, blocks, blocks) for part in (x, image))
+        self.image = None
+        if layout.split:
+            self.image = FusedConv(image)
+        else:
+            x = x._replace(weight=torch.cat((x.weight, image.weight), 1))
+        self.conv1 = FusedConv(x, slopes, maximum=layout.maximum)
+        kernel, slopes = fold_block(stage.conv2)
+        kernel = space_to_depth_kernel(kernel, blocks, blocks)
+        self.conv2 = FusedConv(kernel, slopes.repeat(block * block), maximum=layout.maximum)
+
+    def forward(self, x: Tensor, image: Tensor) -> Tensor:
+        """Map (B, C, H, W) and the image at twice the size to a map of that size, in blocks."""
+        x = self.up(x)
+        if self.unblock > 1:
+            x = depth_to_space(x, self.unblock)
+        x = self.conv1(torch.cat((x, image), 1)) if self.image is None else self.conv1(x, self.image(image))
+        out: Tensor = self.conv2(x)
+        return out
+
+
+class MaskGraph(nn.Module):
+    """A segmentation head up to the mask.
+
+    Args:
+        head: The network's.
+        layout: How to lay it out.
+        masks: What the mask holds.
+        scale: Mask pixels an input pixel, along an axis: 1 or 2.
+        threshold: Probability above which a pixel is foreground.
+    """
+
+    def __init__(self, head: SegmentationHead, layout: Layout, masks: Masks, scale: int, threshold: float) -> None:
+        super().__init__()
+        self.masks = masks
+        self.channels_last = layout.channels_last
+        self.up1 = UpStageGraph(head.up1, layout, 1)
+        self.up2 = UpStageGraph(head.up2, layout, layout.half)
+        slopes = prelu_slopes(head.out.act, 2)
+        threshold = 0.5 if masks == "probability" else threshold
+        self.out: FusedConv | FusedTransposedConv
+        self.difference: FusedConv | None = None
+        self.enlarge: FusedConv | None = None
+        self.scale = scale
+        half = layout.half
+        if layout.channels_last or half == 2:
+            kernel = transposed_as_pointwise(head.out.deconv.weight, head.out.bn)
+            kernel = space_to_depth_kernel(kernel, (half, half), (half, half))
+            self.out = FusedConv(nest_blocks(kernel, half), slopes.repeat(4 * half * half), maximum=layout.maximum)
+            self.block = 2 * half
+            self.difference = FusedConv(mask_difference(self.block**2, threshold))
+            if scale == 2:
+                blocks = (self.block, self.block)
+                kernel = space_to_depth_kernel(upsample_kernel(), blocks, blocks)
+                self.enlarge = FusedConv(nest_blocks(kernel, self.block))
+                self.block *= 2
+        else:
+            self.out = FusedTransposedConv(head.out.deconv, head.out.bn, slopes, maximum=layout.maximum)
+            self.block = 1
+            self.offset = float(mask_difference(1, threshold).bias)
+
+    def forward(self, x: Tensor, i1: Tensor, i2: Tensor) -> Tensor:
+        """Return the mask, (B, scale x H, scale x W) for an input of H x W pixels."""
+        x = self.out(self.up2(self.up1(x, i2), i1))
+        if self.difference is not None:
+            x = self.difference(x)
+            x = x if self.enlarge is None else self.enlarge(x)
+            x = x if self.channels_last else depth_to_space(x, self.block)
+        else:
+            x = x[:, 1:] - x[:, :1] + self.offset
+            if self.scale == 2:
+                x = F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
+        if self.masks == "decision":
+            x = (x > 0).to(torch.uint8)
+        elif self.masks == "probability":
+            x = (torch.sigmoid(x) * 255).round().to(torch.uint8)
+        batch, _, height, width = x.shape
+        if not self.channels_last:
+            return x.reshape(batch, height, width)
+        x = x.permute(0, 2, 3, 1).reshape(batch, height, width, self.block, self.block).permute(0, 1, 3, 2, 4)
+        return x.reshape(batch, height * self.block, width * self.block)
+
+
+class DeployGraph(nn.Module):
+    """The network as one graph from pixels to decoded boxes and masks.
+
+    It equals the network in float32 to rounding: relative error below 1e-5, and more than 0.99999 of mask pixels.
+
+    Args:
+        network: What to rewrite: any variant, tasks, classes and blocks. It is not changed.
+        layout: How to lay it out; all layouts compute the same function.
+        masks: What a mask holds.
+        mask_scale: 2 doubles masks inside the graph (bilinear, before the decision), so that a 1280 x 720 frame on
+            a 640 x 384 canvas needs no resizing of masks; not with ``masks="probability"``.
+        bgr: Take BGR pixels instead of RGB.
+        thresholds: Mask thresholds that "decision" and "logit" use; the card's if left out.
+
+    Raises:
+        ConfigError: If the options do not fit each other.
+    """
+
+    def __init__(
+        self,
+        network: TriLiteNet,
+        layout: Layout | None = None,
+        *,
+        masks: Masks = "decision",
+        mask_scale: int = 1,
+        bgr: bool = False,
+        thresholds: Thresholds | None = None,
+    ) -> None:
+        super().__init__()
+        if masks not in MASKS:
+            raise ConfigError(f"unknown masks {masks!r}; known: {', '.join(MASKS)}")
+        if mask_scale not in (1, 2) or (mask_scale == 2 and masks != "decision"):
+            raise ConfigError(f"mask_scale is 1, or 2 with masks='decision'; got {mask_scale} with {masks!r}")
+        thresholds = thresholds or network.card.thresholds
+        self.layout = layout = layout or Layout()
+        encoder = network.encoder
+        maximum = layout.maximum
+        front = (layout.front, layout.front)
+        # With channels-last input, pairs of rows and columns are regrouped, so that the stem has 12 inputs, not 3.
+        self.block = 2 * layout.front if layout.channels_last else 1
+        source = (self.block, self.block)
+
+        scale, shift = fold_normalisation(network.card.mean, network.card.std)
+        self.scale = constant((scale.flip(0) if bgr else scale).repeat(self.block**2))
+        self.shift = constant((shift.flip(0) if bgr else shift).repeat(self.block**2))
+
+        kernel, slopes = fold_block(encoder.level1)
+        wide = len(slopes)
+        kernel, slopes = merge_pool_into_stem(kernel, slopes)
+        kernel = reverse_inputs(kernel) if bgr else kernel
+        self.stem = FusedConv(
+            space_to_depth_kernel(kernel, source, front), slopes.repeat(layout.front**2), maximum=maximum
+        )
+        pool = pool_kernel(3)
+        self.i2 = FusedConv(space_to_depth_kernel(pad_inputs(pool, wide), front, (1, 1)))
+        pool = reverse_inputs(pool) if bgr else pool
+        self.i1 = FusedConv(space_to_depth_kernel(pool, source, (layout.half, layout.half)))
+
+        kernel, slopes = fold_block(encoder.b1)
+        self.b1 = FusedConv(
+            space_to_depth_kernel(kernel, front, front), slopes.repeat(layout.front**2), maximum=maximum
+        )
+        self.level2_down = StrideESPGraph(encoder.level2_down, layout, front)
+        self.level2 = nn.ModuleList(DepthwiseESPGraph(block, layout) for block in encoder.level2)  # type: ignore[arg-type]
+        kernel, slopes = fold_block(encoder.b2)
+        self.b2_image: FusedConv | None = None
+        if layout.split:
+            kernel, part = split_inputs(kernel, len(slopes) - 3, 3)
+            self.b2_image = FusedConv(part)
+        self.b2 = FusedConv(kernel, slopes, maximum=maximum)
+        self.level3_down = StrideESPGraph(encoder.level3_down, layout, (1, 1))
+        self.level3 = nn.ModuleList(DepthwiseESPGraph(block, layout) for block in encoder.level3)  # type: ignore[arg-type]
+
+        self.detection: DetectionGraph | None = None
+        if network.detection is not None:
+            assert encoder.c4 is not None
+            assert encoder.c5 is not None
+            assert network.litepan is not None
+            self.c4 = FusedConv(*fold_block(encoder.c4), maximum=maximum)
+            self.c5 = FusedConv(*fold_block(encoder.c5), maximum=maximum)
+            self.detection = DetectionGraph(network.litepan, network.spp, network.detection, network.anchors)
+        self.pcaa = None if network.pcaa is None else AttentionGraph(network.pcaa, layout)
+        self.reduce = None if network.reduce is None else FusedConv(*fold_block(network.reduce), maximum=maximum)
+        self.drivable: MaskGraph | None = None
+        self.lane: MaskGraph | None = None
+        if network.drivable is not None:
+            self.drivable = MaskGraph(network.drivable, layout, masks, mask_scale, thresholds.drivable)
+        if network.lane is not None:
+            self.lane = MaskGraph(network.lane, layout, masks, mask_scale, thresholds.lane)
+        self.eval()
+
+    def forward(self, image: Tensor) -> DeployOutputs:
+        """Run the graph.
+
+        Args:
+            image: (B, H, W, 3) uint8 RGB (or BGR, if built so), letterboxed; H and W multiples of 32. A layout that is
+                not channels-last also takes (B, 3, H, W) float32 of 0 .. 255.
+
+        Raises:
+            ShapeError: If it is another shape.
+        """
+        x = self.normalise(image)
+        front = self.stem(x)
+        i2 = self.i2(front)
+        down2 = y = self.level2_down(self.b1(front))
+        for block in self.level2:
+            y = block(y)
+        if self.b2_image is None:
+            c2 = self.b2(torch.cat((y, down2, i2), 1))
+        else:
+            c2 = self.b2(torch.cat((y, down2), 1), self.b2_image(i2))
+        down3 = y = self.level3_down(c2)
+        for block in self.level3:
+            y = block(y)
+        c3 = torch.cat((down3, y), 1)
+
+        detection = drivable = lane = None
+        if self.detection is not None:
+            c4 = self.c4(c3)
+            detection = self.detection(c3, c4, self.c5(c4))
+        if self.reduce is not None:
+            attended = self.reduce(c3 if self.pcaa is None else self.pcaa(c3))
+            i1 = self.i1(x)
+            if self.drivable is not None:
+                drivable = self.drivable(attended, i1, i2)
+            if self.lane is not None:
+                lane = self.lane(attended, i1, i2)
+        return DeployOutputs(detection, drivable, lane)
+
+    def normalise(self, image: Tensor) -> Tensor:
+        """Return pixels as a normalised map, in blocks where the layout is channels-last.
+
+        Scale and shift act on rows flattened to (B, rows, columns x 3), which is one pass over contiguous memory.
+        """
+        if image.ndim == 4 and image.shape[1] == 3 and image.is_floating_point() and not self.layout.channels_last:
+            return image * self.scale.view(1, 3, 1, 1) + self.shift.view(1, 3, 1, 1)
+        if image.ndim != 4 or image.shape[3] != 3:
+            raise ShapeError(f"the deploy graph takes (B, H, W, 3) uint8, got {tuple(image.shape)}")
+        batch, height, width, _ = image.shape
+        if not self.layout.channels_last:
+            x = image.permute(0, 3, 1, 2).float()
+            return x * self.scale.view(1, 3, 1, 1) + self.shift.view(1, 3, 1, 1)
+        block = self.block
+        x = image.reshape(batch, height // block, block, width // block, block * 3).permute(0, 1, 3, 2, 4)
+        # (B, H / block, W / block x block^2 x 3): one long row of cells
+        x = x.reshape(batch, height // block, -1).float()
+        x = x * self.scale.repeat(width // block) + self.shift.repeat(width // block)
+        return x.view(batch, height // block, width // block, block * block * 3).permute(0, 3, 1, 2)

@@ -1,0 +1,48 @@
+"""The deploy graph as OpenVINO IR, by way of ONNX, with the same metadata."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
+from trilitenet.errors import import_extra
+
+__all__ = ["build_openvino", "has_amx", "save_openvino"]
+
+
+def build_openvino(model: Any) -> Any:
+    """Convert an ONNX model in memory.
+
+    Args:
+        model: What `trilitenet.deploy.onnx.build_onnx` returned.
+
+    Returns:
+        An ``openvino.Model``.
+    """
+    openvino = import_extra("openvino", "openvino")
+    return openvino.Core().read_model(model.SerializeToString(), b"")
+
+
+def save_openvino(model: Any, path: str | os.PathLike[str], card: ModelCard, info: ArtefactInfo) -> None:
+    """Write ``.xml`` and ``.bin``.
+
+    Args:
+        model: The ``openvino.Model``.
+        path: The ``.xml`` file.
+        card: What the network is.
+        info: How the artefact takes pixels and returns results; weights of an fp16 artefact are stored as fp16.
+    """
+    openvino = import_extra("openvino", "openvino")
+    model.set_rt_info(card.to_json(), CARD_KEY.split("."))
+    model.set_rt_info(info.to_json(), ARTEFACT_KEY.split("."))
+    openvino.save_model(model, Path(path), compress_to_fp16=info.precision == "fp16")
+
+
+def has_amx() -> bool:
+    """Return whether the processor has matrix tiles (AMX), for which wider layouts pay."""
+    try:
+        return "amx_bf16" in Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        return False

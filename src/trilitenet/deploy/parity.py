@@ -1,0 +1,150 @@
+"""The parity gate: an artefact must say what the float32 network says, on real frames, or it is not written."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.structures import RawOutputs
+
+__all__ = ["TOLERANCES", "Parity", "Tolerance", "compare"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Tolerance:
+    """What an artefact may differ by.
+
+    Attributes:
+        pixels: Least share of mask pixels that agree.
+        boxes: Least share of the network's confident boxes that the artefact has too (IoU of at least 0.9), and the
+            reverse.
+    """
+
+    pixels: float
+    boxes: float
+
+
+TOLERANCES: Final[dict[str, Tolerance]] = {
+    "fp32": Tolerance(pixels=0.9999, boxes=0.995),
+    "fp16": Tolerance(pixels=0.998, boxes=0.95),
+    "bf16": Tolerance(pixels=0.99, boxes=0.85),
+    "int8": Tolerance(pixels=0.90, boxes=0.50),
+}
+"""A precision. INT8 is judged by its scores (``--max-drop``); here it is only kept from being nonsense."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Parity:
+    """How an artefact compares with the network.
+
+    Attributes:
+        frames: Frames compared.
+        pixels: Share of mask pixels that agree, the worse of the two tasks; None without masks.
+        boxes: Share of confident boxes found in both; None without detection, or without any such box.
+        box_error: Mean distance of the sides of such pairs in pixels; None likewise.
+        tolerance: What was asked for.
+    """
+
+    frames: int
+    pixels: float | None
+    boxes: float | None
+    box_error: float | None
+    tolerance: Tolerance
+
+    @property
+    def failures(self) -> list[str]:
+        """What is beyond the tolerance, in words; empty if nothing is."""
+        found = []
+        if self.pixels is not None and self.pixels < self.tolerance.pixels:
+            found.append(f"{self.pixels:.5f} of mask pixels agree, at least {self.tolerance.pixels} must")
+        if self.boxes is not None and self.boxes < self.tolerance.boxes:
+            found.append(f"{self.boxes:.4f} of boxes agree, at least {self.tolerance.boxes} must")
+        return found
+
+    def summary(self) -> str:
+        """Return one line."""
+        parts = [f"{self.frames} frames"]
+        if self.pixels is not None:
+            parts.append(f"mask pixels equal {self.pixels:.6f}")
+        if self.boxes is not None:
+            parts.append(f"boxes in both {self.boxes:.4f} (sides {self.box_error:.2f} px apart)")
+        return "parity: " + ", ".join(parts)
+
+
+def compare(
+    reference: Callable[[NDArray[np.uint8]], RawOutputs],
+    artefact: Callable[[NDArray[np.uint8]], RawOutputs],
+    canvases: Sequence[NDArray[np.uint8]],
+    tolerance: Tolerance,
+    *,
+    masks: tuple[float, float] = (0.5, 0.5),
+    confidence: float = 0.25,
+) -> Parity:
+    """Run both on the same canvases.
+
+    Args:
+        reference: The network, giving probabilities.
+        artefact: The artefact, giving probabilities or decisions.
+        canvases: (H, W, 3) uint8 RGB each.
+        tolerance: What the artefact may differ by.
+        masks: Thresholds of drivable and lane.
+        confidence: Boxes above this are compared.
+    """
+    equal: dict[str, list[float]] = {"drivable": [], "lane": []}
+    matched = total = 0
+    errors: list[float] = []
+    for canvas in canvases:
+        expected, got = reference(canvas[None]), artefact(canvas[None])
+        for name, threshold in zip(("drivable", "lane"), masks, strict=True):
+            wanted, mask = getattr(expected, name), getattr(got, name)
+            if wanted is not None:
+                scale = mask.shape[1] // wanted.shape[1]
+                if scale > 1:  # the middle of each enlarged pixel stands for it
+                    continue
+                limit = int(threshold * 255)
+                equal[name].append(float(np.mean((wanted[0] > limit) == (mask[0] > limit))))
+        if expected.detection is not None and got.detection is not None:
+            pairs = [_match(one, other, confidence) for one, other in _both(expected.detection[0], got.detection[0])]
+            matched += sum(count for count, _, _ in pairs)
+            total += sum(count for _, count, _ in pairs)
+            errors += [error for _, _, found in pairs for error in found]
+    shares = [float(np.mean(values)) for values in equal.values() if values]
+    return Parity(
+        frames=len(canvases),
+        pixels=min(shares) if shares else None,
+        boxes=matched / total if total else None,
+        box_error=float(np.mean(errors)) if errors else (0.0 if total else None),
+        tolerance=tolerance,
+    )
+
+
+def _both(
+    one: NDArray[np.float32], other: NDArray[np.float32]
+) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    return [(one, other), (other, one)]
+
+
+def _match(
+    wanted: NDArray[np.float32], offered: NDArray[np.float32], confidence: float
+) -> tuple[int, int, list[float]]:
+    """Return how many of the confident rows of ``wanted`` have a like row in ``offered``, of how many, and how far off.
+
+    A row must be clearly above the threshold on one side, and need only be near it on the other: rows at the very
+    threshold are decided by rounding.
+    """
+    sure = wanted[wanted[:, 4] * wanted[:, 5:].max(1) > confidence + 0.05]
+    near = offered[offered[:, 4] * offered[:, 5:].max(1) > confidence - 0.05]
+    if not len(sure) or not len(near):
+        return 0, len(sure), []
+    a, b = (np.concatenate((x[:, :2] - x[:, 2:4] / 2, x[:, :2] + x[:, 2:4] / 2), 1) for x in (sure, near))
+    overlap = np.clip(np.minimum(a[:, None, 2:], b[None, :, 2:]) - np.maximum(a[:, None, :2], b[None, :, :2]), 0, None)
+    shared = overlap.prod(2)
+    areas = sure[:, 2:4].prod(1)[:, None] + near[:, 2:4].prod(1)[None] - shared
+    iou = shared / np.maximum(areas, 1e-9)
+    best = iou.argmax(1)
+    good = iou[np.arange(len(sure)), best] >= 0.9
+    return int(good.sum()), len(sure), np.abs(a - b[best]).mean(1)[good].tolist()

@@ -1,0 +1,149 @@
+"""INT8: post-training static quantisation of the rewritten graph, symmetric, with bias correction.
+
+Activations are quantised symmetrically: the other way leaves the matrix units of the processor. Matrix products of the
+attention and depthwise convolutions stay out, since they gain nothing; so do, step by step, the layers whose errors
+reach the results directly, until the scores stay within a budget (`KEEP_STEPS`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import tempfile
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from numpy.typing import NDArray
+
+from trilitenet.errors import ConfigError, import_extra
+
+__all__ = ["KEEP_STEPS", "kept_nodes", "quantize_onnx", "quantize_openvino"]
+
+KEEP_STEPS: Final[tuple[tuple[str, ...], ...]] = (
+    (),
+    ("difference", "heads"),
+    ("difference", "heads", "out", "stem", "i1", "i2"),
+    ("difference", "heads", "out", "stem", "i1", "i2", "up2", "smooth", "laterals"),
+    ("difference", "heads", "out", "stem", "i1", "i2", "up2", "up1", "smooth", "laterals", "merge", "level2", "b1"),
+)
+"""Parts of the deploy graph that stay in floating point, one step of the fall-back after the other: nothing; what
+decides masks and boxes; the first and last layers; the heads at 1/2; the heads and the encoder down to 1/4."""
+
+
+def kept_nodes(names: Sequence[str], parts: Sequence[str]) -> list[str]:
+    """Return the nodes that belong to one of the parts.
+
+    Args:
+        names: Node names, paths of modules joined by ``/``.
+        parts: Names of modules of the deploy graph.
+    """
+    return [name for name in names if set(parts) & set(name.split("/"))]
+
+
+def quantize_openvino(model: Any, images: Sequence[NDArray[Any]], keep: Sequence[str] = ()) -> Any:
+    """Quantise an OpenVINO model with NNCF.
+
+    Args:
+        model: The ``openvino.Model``; it is not changed.
+        images: Inputs of the artefact, each with a leading 1, from the training split.
+        keep: Parts that stay in floating point, see `KEEP_STEPS`.
+
+    Returns:
+        The quantised ``openvino.Model``.
+
+    Raises:
+        ConfigError: If there are no images.
+        MissingExtraError: If NNCF is not installed.
+    """
+    _check(images)
+    nncf = import_extra("nncf", "openvino")
+    names = [node.get_friendly_name() for node in model.get_ops() if node.get_type_name() != "Constant"]
+    with _quiet():
+        nncf.set_log_level(logging.ERROR)
+        return nncf.quantize(
+            model,
+            nncf.Dataset(list(images)),
+            preset=nncf.QuantizationPreset.PERFORMANCE,
+            target_device=nncf.TargetDevice.CPU,
+            subset_size=len(images),
+            fast_bias_correction=True,
+            ignored_scope=nncf.IgnoredScope(
+                names=kept_nodes(names, keep), types=["MatMul", "GroupConvolution"], validate=False
+            ),
+        )
+
+
+def quantize_onnx(model: Any, images: Sequence[NDArray[Any]], keep: Sequence[str] = ()) -> Any:
+    """Quantise an ONNX model with ONNX Runtime: QDQ, symmetric INT8 activations, INT8 weights a channel.
+
+    Args:
+        model: The ``onnx.ModelProto``; it is not changed.
+        images: Inputs of the artefact, each with a leading 1, from the training split.
+        keep: Parts that stay in floating point, see `KEEP_STEPS`.
+
+    Returns:
+        The quantised ``onnx.ModelProto``, with the metadata of the model.
+    """
+    _check(images)
+    onnx = import_extra("onnx", "onnx")
+    quantization = import_extra("onnxruntime.quantization", "onnx")
+    shape_inference = import_extra("onnxruntime.quantization.shape_inference", "onnx")
+    convolutions = [node for node in model.graph.node if node.op_type == "Conv"]
+    depthwise = [
+        node.name
+        for node in convolutions
+        if any(attribute.name == "group" and attribute.i > 1 for attribute in node.attribute)
+    ]
+
+    class Frames(quantization.CalibrationDataReader):  # type: ignore[misc, name-defined]
+        def __init__(self) -> None:
+            self.rest: Iterator[Mapping[str, NDArray[Any]]] = iter([{"image": image} for image in images])
+
+        def get_next(self) -> Mapping[str, NDArray[Any]] | None:
+            return next(self.rest, None)
+
+    with tempfile.TemporaryDirectory() as folder, _quiet():
+        source, prepared, target = (Path(folder) / name for name in ("a.onnx", "b.onnx", "c.onnx"))
+        source.write_bytes(model.SerializeToString())
+        shape_inference.quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
+        quantization.quantize_static(
+            str(prepared),
+            str(target),
+            Frames(),
+            quant_format=quantization.QuantFormat.QDQ,
+            op_types_to_quantize=["Conv"],
+            per_channel=True,
+            activation_type=quantization.QuantType.QInt8,
+            weight_type=quantization.QuantType.QInt8,
+            nodes_to_exclude=[*depthwise, *kept_nodes([node.name for node in convolutions], keep)],
+            extra_options={"ActivationSymmetric": True},
+        )
+        quantized = onnx.load(str(target))
+    del quantized.metadata_props[:]
+    onnx.helper.set_model_props(quantized, {entry.key: entry.value for entry in model.metadata_props})
+    return quantized
+
+
+def _check(images: Sequence[NDArray[Any]]) -> None:
+    if not images:
+        raise ConfigError("INT8 needs calibration frames; give --calibration with a folder of road frames")
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the quantisers from talking."""
+    previous = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with (
+            warnings.catch_warnings(),
+            Path(os.devnull).open("w", encoding="utf-8") as sink,
+            contextlib.redirect_stdout(sink),
+        ):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(previous)

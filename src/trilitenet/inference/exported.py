@@ -1,0 +1,92 @@
+"""What backends of exported artefacts share: reading their metadata, their input and their outputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
+from trilitenet.errors import ShapeError, WeightsError
+from trilitenet.structures import RawOutputs
+
+__all__ = ["prepare_input", "read_metadata", "run_images"]
+
+
+def read_metadata(metadata: Mapping[str, str], source: str) -> tuple[ModelCard, ArtefactInfo]:
+    """Return the card and the description of an artefact.
+
+    Args:
+        metadata: The artefact's own key-value pairs.
+        source: The file, for messages.
+
+    Raises:
+        WeightsError: If they are missing, broken or of a newer layout.
+    """
+    for key in (CARD_KEY, ARTEFACT_KEY):
+        if key not in metadata:
+            raise WeightsError(f"{source}: no {key!r} in its metadata; export it with: trilitenet export")
+    return ModelCard.from_json(metadata[CARD_KEY], source), ArtefactInfo.from_json(metadata[ARTEFACT_KEY], source)
+
+
+def prepare_input(image: NDArray[np.uint8], info: ArtefactInfo) -> NDArray[Any]:
+    """Turn (H, W, 3) uint8 RGB into the artefact's input for one image.
+
+    Raises:
+        ShapeError: If the artefact is for another size.
+    """
+    size = image.shape[:2]
+    if info.size is not None and size != info.size:
+        raise ShapeError(
+            f"this artefact takes {info.size[1]}x{info.size[0]} pixels, got {size[1]}x{size[0]}; export another --size"
+        )
+    if info.colour == "bgr":
+        image = image[:, :, ::-1]
+    if info.input == "float_nchw":
+        return np.ascontiguousarray(image.transpose(2, 0, 1)[None], np.float32)
+    return np.ascontiguousarray(image[None])
+
+
+def run_images(
+    batch: NDArray[np.uint8],
+    card: ModelCard,
+    outputs: Callable[[], list[Mapping[str, NDArray[Any]]]],
+    info: ArtefactInfo,
+) -> RawOutputs:
+    """Check a batch, run it, and gather what an artefact returns for each image.
+
+    Args:
+        batch: (B, H, W, 3) uint8 RGB.
+        card: Its tasks say which outputs there are.
+        outputs: Runs the batch; a mapping from output name to array with a leading 1, for each image.
+        info: How masks are to be read.
+
+    Raises:
+        ShapeError: If the batch is of another shape or type.
+    """
+    if batch.ndim != 4 or batch.shape[3] != 3 or batch.dtype != np.uint8:
+        raise ShapeError(f"a batch must be (B, H, W, 3) uint8, got {batch.shape} {batch.dtype}")
+    results = outputs()
+
+    def mask(name: str) -> NDArray[np.uint8] | None:
+        if name not in card.tasks:
+            return None
+        return np.concatenate([_probability(result[name], info) for result in results])
+
+    detection = None
+    if "detection" in card.tasks:
+        rows = [np.asarray(result["detection"], np.float32).reshape(-1, 5 + card.classes) for result in results]
+        detection = np.zeros((len(rows), max(len(row) for row in rows), 5 + card.classes), np.float32)
+        for padded, row in zip(detection, rows, strict=True):  # after suppression, images have different counts
+            padded[: len(row)] = row
+    return RawOutputs(detection, mask("drivable"), mask("lane"))
+
+
+def _probability(mask: NDArray[Any], info: ArtefactInfo) -> NDArray[np.uint8]:
+    """Return a mask as probability x 255; a decided one has 0 and 255."""
+    if info.masks == "probability":
+        return np.asarray(mask, np.uint8)
+    decided = mask if info.masks == "decision" else (mask > 0).astype(np.uint8)
+    return np.multiply(decided, np.uint8(255), dtype=np.uint8)

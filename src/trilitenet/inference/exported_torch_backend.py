@@ -1,0 +1,83 @@
+"""Exported ``.pt2`` artefacts: the deploy graph as a PyTorch program, without the package's own modules."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ModelCard
+from trilitenet.errors import WeightsError
+from trilitenet.inference.exported import prepare_input, read_metadata, run_images
+from trilitenet.inference.torch_backend import pick_device
+from trilitenet.structures import RawOutputs
+
+__all__ = ["ExportedTorchBackend"]
+
+
+class ExportedTorchBackend:
+    """An artefact of ``trilitenet export --format torch``.
+
+    Args:
+        path: The ``.pt2`` file.
+        device: As `trilitenet.inference.torch_backend.pick_device` takes it; only the CPU is tested.
+
+    Raises:
+        WeightsError: If the file is missing, broken or foreign, or of a newer layout.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], device: str = "auto") -> None:
+        path = Path(path)
+        if not path.is_file():
+            raise WeightsError(f"{path}: no such file")
+        metadata: dict[str, Any] = {CARD_KEY: "", ARTEFACT_KEY: ""}
+        try:
+            program = torch.export.load(path, extra_files=metadata)
+        except Exception as error:  # a broken archive fails in many ways
+            raise WeightsError(f"{path}: not a usable PyTorch program ({str(error).splitlines()[0][:160]})") from error
+        found = {key: value.decode() if isinstance(value, bytes) else value for key, value in metadata.items() if value}
+        self._card, self.info = read_metadata(found, str(path))
+        self.device = pick_device("cpu" if device == "auto" else device)
+        self._module = program.module().to(self.device)
+
+    @property
+    def card(self) -> ModelCard:
+        """What the network is."""
+        return self._card
+
+    @property
+    def name(self) -> str:
+        """The runtime and the device."""
+        return f"torch program {self.device}"
+
+    @property
+    def canvas(self) -> tuple[int, int] | None:
+        """The artefact's input size, None if it is dynamic."""
+        return self.info.size
+
+    def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
+        """Run the network on (B, H, W, 3) uint8 RGB; see `Backend.run`."""
+
+        def outputs() -> list[Mapping[str, NDArray[Any]]]:
+            with torch.no_grad():
+                return [
+                    {
+                        name: value.cpu().numpy()
+                        for name, value in zip(
+                            self._card.tasks,
+                            self._module(torch.from_numpy(prepare_input(image, self.info)).to(self.device)),
+                            strict=True,
+                        )
+                    }
+                    for image in batch
+                ]
+
+        return run_images(batch, self._card, outputs, self.info)
+
+    def close(self) -> None:
+        """Nothing to free."""

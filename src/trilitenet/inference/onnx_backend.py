@@ -1,0 +1,98 @@
+"""Exported ``.onnx`` artefacts on ONNX Runtime. PyTorch is not needed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.config import ModelCard
+from trilitenet.errors import BackendError, WeightsError, import_extra
+from trilitenet.inference.exported import prepare_input, read_metadata, run_images
+from trilitenet.structures import RawOutputs
+
+__all__ = ["OnnxBackend"]
+
+
+class OnnxBackend:
+    """An artefact of ``trilitenet export --format onnx`` on ONNX Runtime.
+
+    Args:
+        path: The ``.onnx`` file.
+        device: ``"auto"`` (CUDA where this ONNX Runtime has it), ``"cpu"`` or ``"cuda"``.
+        threads: Threads of the CPU provider; ONNX Runtime's own choice if left out.
+
+    Attributes:
+        info: How the artefact takes pixels and returns results.
+
+    Raises:
+        MissingExtraError: If ONNX Runtime is not installed.
+        WeightsError: If the file is missing, broken or foreign, or of a newer layout.
+        BackendError: If the device is not there.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], device: str = "auto", *, threads: int | None = None) -> None:
+        runtime = import_extra("onnxruntime", "onnx")
+        path = Path(path)
+        if not path.is_file():
+            raise WeightsError(f"{path}: no such file")
+        available = runtime.get_available_providers()
+        if device not in ("auto", "cpu", "cuda"):
+            raise BackendError(f"device {device!r} is not one of ONNX Runtime's here; use auto, cpu or cuda")
+        if device == "cuda" and "CUDAExecutionProvider" not in available:
+            raise BackendError("this ONNX Runtime has no CUDA; install onnxruntime-gpu, or use device='cpu'")
+        providers = ["CPUExecutionProvider"]
+        if device != "cpu" and "CUDAExecutionProvider" in available:
+            providers.insert(0, "CUDAExecutionProvider")
+        options = runtime.SessionOptions()
+        options.log_severity_level = 3
+        if threads is not None:
+            options.intra_op_num_threads = threads
+        try:
+            self._session = runtime.InferenceSession(str(path), options, providers=providers)
+        except Exception as error:  # its exceptions share no base class of their own
+            reason = " ".join(str(error).split())[:160]
+            raise WeightsError(f"{path}: not a usable ONNX model ({reason})") from error
+        self._card, self.info = read_metadata(self._session.get_modelmeta().custom_metadata_map, str(path))
+        self._input = self._session.get_inputs()[0].name
+        self._outputs = [output.name for output in self._session.get_outputs()]
+        self._device = "cuda" if self._session.get_providers()[0].startswith("CUDA") else "cpu"
+
+    @property
+    def card(self) -> ModelCard:
+        """What the network is."""
+        return self._card
+
+    @property
+    def name(self) -> str:
+        """The runtime and the device."""
+        return f"onnxruntime {self._device} {self.info.precision}"
+
+    @property
+    def canvas(self) -> tuple[int, int] | None:
+        """The artefact's input size, None if it is dynamic."""
+        return self.info.size
+
+    def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
+        """Run the network on (B, H, W, 3) uint8 RGB; see `Backend.run`."""
+
+        def outputs() -> list[Mapping[str, NDArray[Any]]]:
+            return [
+                dict(
+                    zip(
+                        self._outputs,
+                        self._session.run(None, {self._input: prepare_input(image, self.info)}),
+                        strict=True,
+                    )
+                )
+                for image in batch
+            ]
+
+        return run_images(batch, self._card, outputs, self.info)
+
+    def close(self) -> None:
+        """Nothing to free before the object goes."""

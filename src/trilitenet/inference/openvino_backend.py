@@ -1,0 +1,141 @@
+"""Exported artefacts on OpenVINO: ``.xml`` of its own and ``.onnx``. PyTorch is not needed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ModelCard
+from trilitenet.errors import BackendError, ConfigError, WeightsError, import_extra
+from trilitenet.inference.exported import prepare_input, read_metadata, run_images
+from trilitenet.structures import RawOutputs
+
+__all__ = ["OpenVINOBackend"]
+
+_HINTS = {"fp32": "f32", "fp16": "f16", "bf16": "bf16"}
+
+
+class OpenVINOBackend:
+    """An artefact of ``trilitenet export --format openvino`` (or ``onnx``) on OpenVINO.
+
+    Args:
+        path: The ``.xml`` file, with its ``.bin`` beside it, or an ``.onnx`` file.
+        device: ``"auto"`` (the CPU), ``"cpu"``, ``"gpu"`` or another name of OpenVINO's.
+        precision: What to compute in: ``"fp32"``, ``"bf16"`` or ``"fp16"``. By default what the artefact was exported
+            for; INT8 layers stay INT8, the others of such an artefact compute in bf16 where the processor has it.
+        streams: Images that are computed at once; more than one raises frames a second and latency.
+        threads: Threads in all; OpenVINO's own choice if left out.
+
+    Attributes:
+        info: How the artefact takes pixels and returns results.
+        precision: What it computes in; bf16 falls back to fp32 where the processor lacks it.
+
+    Raises:
+        MissingExtraError: If OpenVINO is not installed.
+        WeightsError: If the file is missing, broken or foreign, or of a newer layout.
+        BackendError: If the device is not there.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        device: str = "auto",
+        *,
+        precision: str | None = None,
+        streams: int = 1,
+        threads: int | None = None,
+    ) -> None:
+        openvino = import_extra("openvino", "openvino")
+        path = Path(path)
+        if not path.is_file():
+            raise WeightsError(f"{path}: no such file")
+        if streams < 1:
+            raise ConfigError(f"streams must be at least 1, got {streams}")
+        core = openvino.Core()
+        try:
+            model = core.read_model(path)
+        except RuntimeError as error:
+            reason = " ".join(str(error).split())[:160]
+            raise WeightsError(f"{path}: not a usable OpenVINO or ONNX model ({reason})") from error
+        self._card, self.info = read_metadata(_metadata(model), str(path))
+        self._device = "CPU" if device == "auto" else device.upper()
+        if self._device.split(".")[0] not in {name.split(".")[0] for name in core.available_devices}:
+            raise BackendError(f"OpenVINO has no device {device!r} here; it has {', '.join(core.available_devices)}")
+        wanted = precision or ("bf16" if self.info.precision == "int8" else self.info.precision)
+        if wanted not in _HINTS:
+            raise ConfigError(f"unknown precision {wanted!r}; known: {', '.join(_HINTS)}")
+        capable = {str(name).lower() for name in core.get_property(self._device, "OPTIMIZATION_CAPABILITIES")}
+        self.precision = wanted if wanted in capable else "fp32"
+        options: dict[str, Any] = {
+            "INFERENCE_PRECISION_HINT": _HINTS[self.precision],
+            "PERFORMANCE_HINT": "LATENCY" if streams == 1 else "THROUGHPUT",
+        }
+        if self._device == "CPU":
+            options["NUM_STREAMS"] = str(streams)
+            if threads is not None:
+                options["INFERENCE_NUM_THREADS"] = threads
+        try:
+            self._compiled = core.compile_model(model, self._device, options)
+        except RuntimeError as error:
+            raise BackendError(
+                f"{path}: OpenVINO cannot compile it for {self._device} ({' '.join(str(error).split())[:160]})"
+            ) from error
+        self._outputs = [output.get_any_name() for output in self._compiled.outputs]
+        self.streams = streams
+        self._requests = [self._compiled.create_infer_request() for _ in range(streams)]
+
+    @property
+    def card(self) -> ModelCard:
+        """What the network is."""
+        return self._card
+
+    @property
+    def name(self) -> str:
+        """The runtime, the device, the precision and the streams."""
+        precision = "int8" if self.info.precision == "int8" else self.precision
+        return f"openvino {self._device.lower()} {precision}" + (f" x{self.streams}" if self.streams > 1 else "")
+
+    @property
+    def canvas(self) -> tuple[int, int] | None:
+        """The artefact's input size, None if it is dynamic."""
+        return self.info.size
+
+    def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
+        """Run the network on (B, H, W, 3) uint8 RGB; images of a batch share the streams. See `Backend.run`."""
+
+        def outputs() -> list[Mapping[str, NDArray[Any]]]:
+            results: list[Mapping[str, NDArray[Any]]] = []
+            for start in range(0, len(batch), self.streams):
+                inputs = [prepare_input(image, self.info) for image in batch[start : start + self.streams]]
+                busy = self._requests[: len(inputs)]
+                for request, image in zip(busy, inputs, strict=True):
+                    request.start_async([image], share_inputs=True)
+                for request in busy:
+                    request.wait()
+                    # Copies: the request's own memory is written again by its next image.
+                    results.append(
+                        {name: np.array(request.get_output_tensor(i).data) for i, name in enumerate(self._outputs)}
+                    )
+            return results
+
+        return run_images(batch, self._card, outputs, self.info)
+
+    def close(self) -> None:
+        """Free the compiled model's requests."""
+        self._requests = []
+
+
+def _metadata(model: Any) -> dict[str, str]:
+    """Return an OpenVINO model's own key-value pairs, wherever the format keeps them."""
+    found = {}
+    for key in (CARD_KEY, ARTEFACT_KEY):
+        for path in (key.split("."), ["framework", key], ["framework", *key.split(".")]):
+            if model.has_rt_info(path):
+                found[key] = str(model.get_rt_info(path).astype(str))
+                break
+    return found
