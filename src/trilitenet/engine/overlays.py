@@ -35,14 +35,15 @@ def error_overlay(
         prediction: In pixels of the image.
         task: The task to show.
         confidence: Boxes above this are drawn.
-        width: Pixels across the picture; a smaller image is not enlarged.
+        width: At most so many pixels across the picture.
         quality: Of the JPEG, 1 to 100.
 
     Returns:
         The bytes of a JPEG file.
     """
     height, full = sample.image.shape[:2]
-    scale = min(1.0, width / full)
+    # Shrinking by a whole number is many times faster.
+    scale = 1 / -(-full // width)
     size = (max(1, round(full * scale)), max(1, round(height * scale)))
     picture = cv2.resize(sample.image, size, interpolation=cv2.INTER_AREA)
     if task == "detection":

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from trilitenet.errors import ShapeError
 from trilitenet.metrics.arithmetic import box_area, box_cover, box_overlap, mean_known, ratio
+from trilitenet.metrics.ranking import RankedBoxes, RankedSums
 from trilitenet.metrics.rows import Rows
 
 __all__ = ["AREAS", "IOU_THRESHOLDS", "DetectionCurve", "DetectionMetric", "DetectionScores", "OperatingPoint"]
@@ -40,6 +41,7 @@ AREAS: Final[dict[str, tuple[float, float]]] = {
 }
 """Box areas, in square pixels of the image as stored, both ends included (COCO's)."""
 _RECALLS: Final[FloatArray] = np.linspace(0.0, 1.0, 101)
+_ALL_BITS: Final = (1 << len(IOU_THRESHOLDS)) - 1
 _EPS: Final = float(np.spacing(1))
 
 
@@ -292,12 +294,6 @@ class DetectionMetric:
 
     # Scores -------------------------------------------------------------------------------------------------------
 
-    def _sorted(self, number: int | None) -> NDArray[np.int64]:
-        """Return positions of the boxes of a class (None = all), best first, as COCO sorts them."""
-        scores = self._scores.array[:, 0]
-        picked = np.arange(len(scores)) if number is None else np.flatnonzero(self._class.array[:, 0] == number)
-        return picked[np.argsort(-scores[picked], kind="stable")]
-
     def _objects_of(self, number: int, area: int, weights: NDArray[Any] | None) -> FloatArray:
         column = self._objects.array[:, number * len(AREAS) + area].astype(np.float64)
         return np.array([column.sum()]) if weights is None else np.asarray(weights, np.float64) @ column
@@ -320,25 +316,26 @@ class DetectionMetric:
         out = np.full((rounds, len(self.class_names), len(chosen)), np.nan)
         column = list(AREAS).index(area)
         for number in range(len(self.class_names)):
-            order = self._sorted(number)
-            image = self._image.array[order, 0]
-            matched = self._matched.array[order, column]
-            counted = self._ignored.array[order, column]
+            mine = np.flatnonzero(self._class.array[:, 0] == number)
+            ranked = RankedBoxes(
+                self._scores.array[mine, 0],
+                self._image.array[mine, 0],
+                self._matched.array[mine, column],
+                self._ignored.array[mine, column],
+                len(self),
+                _ALL_BITS,
+            )
             objects = self._objects_of(number, column, weights)
-            for position, level in enumerate(chosen):
-                bit = np.uint16(1 << level)
-                use = (counted & bit) == 0
-                hit = (matched[use] & bit) != 0
-                images = image[use]
-                for index in range(rounds):
-                    if objects[index] > 0:
-                        weight = None if weights is None else weights[index][images]
-                        out[index, number, position] = _ap(hit, weight, float(objects[index]))
+            for sums in ranked.sums(weights, len(self)):
+                for position, level in enumerate(chosen):
+                    bit = np.uint16(1 << level)
+                    hit, counted = (ranked.right & bit) != 0, (ranked.ignored & bit) == 0
+                    out[sums.rows, number, position] = _ap(sums, hit, counted, objects[sums.rows])
         return out
 
     def curve(self) -> DetectionCurve:
         """Return precision and recall at IoU 0.5 along falling confidence, all classes together."""
-        order = self._sorted(None)
+        order = np.argsort(-self._scores.array[:, 0], kind="stable")
         bit = np.uint16(1)
         order = order[(self._ignored.array[order, 0] & bit) == 0]
         hit = (self._matched.array[order, 0] & bit) != 0
@@ -464,27 +461,27 @@ class DetectionMetric:
         return metric
 
 
-def _ap(hit: NDArray[np.bool_], weight: NDArray[Any] | None, objects: float) -> float:
-    """Return the 101-point AP of boxes sorted by falling confidence."""
-    if not len(hit):
-        return 0.0
-    if weight is None:
-        right = np.cumsum(hit, dtype=np.float64)
-        total = np.arange(1, len(hit) + 1, dtype=np.float64)
-    else:
-        right = np.cumsum(np.where(hit, weight, 0), dtype=np.float64)
-        total = np.cumsum(weight, dtype=np.float64)
+def _ap(sums: RankedSums, hit: NDArray[np.bool_], counted: NDArray[np.bool_], objects: FloatArray) -> FloatArray:
+    """Return the (B,) 101-point AP, NaN without objects.
+
+    Args:
+        sums: Of the ranked boxes, under B weightings.
+        hit: (K,) whether each is right.
+        counted: (K,) whether each counts at all.
+        objects: (B,) weight of the true boxes.
+    """
+    right = np.cumsum(sums.weight * hit, axis=1)
+    wrong = sums.before + np.cumsum(sums.weight * (counted & ~hit), axis=1)
     # Precision is highest right after a hit, so only those positions matter.
-    at = np.flatnonzero(hit)
-    right, total = right[at], total[at]
-    precision = right / (total + _EPS)
-    envelope = np.maximum.accumulate(precision[::-1])[::-1]
-    position = np.searchsorted(right / objects, _RECALLS, side="left")
-    return (
-        float(np.where(position < len(envelope), envelope[np.minimum(position, len(envelope) - 1)], 0).mean())
-        if len(envelope)
-        else 0.0
-    )
+    right, wrong = right[:, hit], wrong[:, hit]
+    precision = right / (right + wrong + _EPS)
+    envelope = np.maximum.accumulate(precision[:, ::-1], axis=1)[:, ::-1]
+    envelope = np.concatenate([envelope, np.zeros((len(envelope), 1))], axis=1)
+    out = np.full(len(objects), np.nan)
+    for row in np.flatnonzero(objects > 0):
+        position = np.searchsorted(right[row] / objects[row], _RECALLS, side="left")
+        out[row] = envelope[row, position].mean()
+    return out
 
 
 def _best_point(curve: DetectionCurve) -> OperatingPoint:

@@ -106,18 +106,20 @@ def thin(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     # Neighbours P2 .. P9 clockwise from above, bit 0 .. 7.
     offsets = (-stride, -stride + 1, 1, stride + 1, stride, stride - 1, -1, -stride - 1)
     tables = _thinning_tables()
-    pixels = np.flatnonzero(flat)
+    pixels = np.flatnonzero(flat.view(np.bool_))
+    code = np.zeros(len(flat), np.uint8)
+    for bit, offset in enumerate(offsets):
+        code[pixels - offset] |= np.uint8(1 << bit)
     changed = True
     while changed:
         changed = False
         for table in tables:
-            code = np.zeros(len(pixels), np.uint8)
-            for bit, offset in enumerate(offsets):
-                code |= flat[pixels + offset] << np.uint8(bit)
-            gone = table[code]
-            if gone.any():
-                flat[pixels[gone]] = 0
-                pixels = pixels[~gone]
+            goes = table[code[pixels]]
+            if goes.any():
+                gone, pixels = pixels[goes], pixels[~goes]
+                flat[gone] = 0
+                for bit, offset in enumerate(offsets):
+                    code[gone - offset] &= np.uint8(255 - (1 << bit))
                 changed = True
     return np.array(padded[1:-1, 1:-1], np.uint8)
 

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from trilitenet.errors import ConfigError, ShapeError
 from trilitenet.metrics.arithmetic import box_overlap, mean_known, ratio, weighted_sum
 from trilitenet.metrics.detection import IOU_THRESHOLDS
+from trilitenet.metrics.ranking import RankedBoxes, RankedSums
 from trilitenet.metrics.rows import Rows
 from trilitenet.metrics.segmentation import as_binary, confusion
 
@@ -298,23 +299,27 @@ class PublishedDetection:
         shape = (rounds, self.classes)
         recall, precision = np.full(shape, np.nan), np.full(shape, np.nan)
         ap = np.full((*shape, len(self._thresholds)), np.nan)
+        nothing = np.zeros(len(self._scores), np.uint16)
         for number in range(self.classes):
-            picked = np.flatnonzero(self._class.array[:, 0] == number)
-            order = picked[np.argsort(-self._scores.array[picked, 0], kind="stable")]
-            image, right = self._image.array[order, 0], self._right.array[order, 0]
-            for row in np.flatnonzero(objects[:, number] > 0):
-                weight = np.ones(len(order)) if weights is None else np.asarray(weights[row], np.float64)[image]
+            mine = np.flatnonzero(self._class.array[:, 0] == number)
+            ranked = RankedBoxes(
+                self._scores.array[mine, 0],
+                self._image.array[mine, 0],
+                self._right.array[mine, 0],
+                nothing[mine],
+                len(self),
+                (1 << len(self._thresholds)) - 1,
+            )
+            for sums in ranked.sums(weights, len(self)):
+                count = objects[sums.rows, number]
                 for level in range(len(self._thresholds)):
-                    hit = (right >> np.uint16(level)) & np.uint16(1) != 0
-                    found, wrong = np.cumsum(weight * hit), np.cumsum(weight * ~hit)
-                    if not len(found) or found[-1] + wrong[-1] == 0:
-                        recall[row, number] = precision[row, number] = ap[row, number, level] = 0.0
-                        continue
-                    use = weight > 0
-                    curve = found[use] / objects[row, number], found[use] / (found + wrong)[use]
-                    ap[row, number, level] = published_average_precision(*curve)
+                    hit = (ranked.right & np.uint16(1 << level)) != 0
+                    ap[sums.rows, number, level] = _published_ap(sums, hit, count)
                     if level == 0:
-                        recall[row, number], precision[row, number] = curve[0][-1], curve[1][-1]
+                        found = (sums.weight * hit).sum(axis=1)
+                        boxes = sums.weight.sum(axis=1) + sums.wrong
+                        recall[sums.rows, number] = ratio(found, count)
+                        precision[sums.rows, number] = np.where(count > 0, np.nan_to_num(ratio(found, boxes)), np.nan)
         return {
             "recall": mean_known(recall),
             "precision": mean_known(precision),
@@ -356,6 +361,36 @@ class PublishedDetection:
         metric._objects.append(np.asarray(state["objects"], np.int32).reshape(-1, metric.classes))
         metric._labelled.append(np.asarray(state["labelled"], np.bool_).reshape(-1, 1))
         return metric
+
+
+def _published_ap(sums: RankedSums, hit: NDArray[np.bool_], objects: FloatArray) -> FloatArray:
+    """Return the (B,) published average precision, NaN without objects.
+
+    Args:
+        sums: Of the ranked boxes, under B weightings.
+        hit: (K,) whether each is right.
+        objects: (B,) weight of the true boxes.
+    """
+    right = np.cumsum(sums.weight * hit, axis=1)
+    wrong = sums.before + np.cumsum(sums.weight * ~hit, axis=1)
+    right, wrong, last = right[:, hit], wrong[:, hit], (sums.wrong + (sums.weight * ~hit).sum(axis=1))
+    out = np.full(len(objects), np.nan)
+    for row in np.flatnonzero(objects > 0):
+        found, bad = right[row], wrong[row]
+        if found.size == 0 or found[-1] == 0:
+            out[row] = 0.0
+            continue
+        # Wherever wrong boxes follow a right one the curve has a second point at the same recall, just before the
+        # next right box; the last of them ends the curve.
+        recall = np.repeat(found / objects[row], 2)
+        precision = np.empty(2 * len(found))
+        precision[0::2] = found / np.maximum(found + bad, 1)
+        following = np.append(bad[1:], last[row])
+        precision[1::2] = found / np.maximum(found + following, 1)
+        if bad[0] > 0:
+            recall, precision = np.insert(recall, 0, 0.0), np.insert(precision, 0, 0.0)
+        out[row] = published_average_precision(recall, precision)
+    return out
 
 
 def published_average_precision(recall: FloatArray, precision: FloatArray) -> float:

@@ -1,0 +1,89 @@
+"""How much longer evaluating takes than inference alone, and how much memory it needs.
+
+    python benchmarks/evaluate.py MODEL [--frames 1000] [--unique 100] [--protocol fair]
+
+Synthetic scenes of 1280x720 are written to a temporary folder first, ``--unique`` of them, and taken round and round.
+Inference alone reads each image file and calls the predictor (letterbox, network, masks and boxes at native size).
+Evaluation reads the labels too, scores everything, keeps pictures of the worst images, and computes intervals. The two
+alternate in rounds within one process, so that whatever else the machine does hits both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+from trilitenet.commands.load import load
+from trilitenet.data.reading import DrivingDataset, decode_image
+from trilitenet.data.sample import Sample
+from trilitenet.data.synthetic_files import write_dataset
+from trilitenet.engine.evaluate import evaluate
+from trilitenet.engine.provenance import describe_hardware, peak_memory
+
+
+class Repeated:
+    """The first ``count`` images of a data set that starts again when it ends."""
+
+    def __init__(self, dataset: DrivingDataset, count: int) -> None:
+        self._dataset, self._count = dataset, count
+        self.class_names = dataset.class_names
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index: int) -> Sample:
+        return self._dataset[index % len(self._dataset)]
+
+
+def infer(model: object, dataset: DrivingDataset, count: int) -> float:
+    start = time.perf_counter()
+    for index in range(count):
+        path = dataset.image_path(index % len(dataset))
+        model.perceive([decode_image(path.read_bytes(), path.name)])  # type: ignore[attr-defined]
+    return time.perf_counter() - start
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("model", nargs="?", default="tiny")
+    parser.add_argument("--frames", type=int, default=1000)
+    parser.add_argument("--unique", type=int, default=100)
+    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--protocol", default="fair")
+    parser.add_argument("--backend", default="auto")
+    parser.add_argument("--data", type=Path, help="a data set to use instead of synthetic scenes")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        root = arguments.data
+        if root is None:
+            root = Path(folder)
+            write_dataset(root, "val", arguments.unique, 0, size=(720, 1280))
+        dataset = DrivingDataset(root, "val")
+        height, width = dataset[0].size
+        model = load(arguments.model, backend=arguments.backend)
+        count = arguments.frames // arguments.rounds
+        infer(model, dataset, 10)
+        evaluate(model, Repeated(dataset, 10), protocol=arguments.protocol)
+        before = peak_memory()
+        alone, scored = [], []
+        for _ in range(arguments.rounds):
+            alone.append(infer(model, dataset, count))
+            start = time.perf_counter()
+            evaluate(model, Repeated(dataset, count), protocol=arguments.protocol)
+            scored.append(time.perf_counter() - start)
+        ratios = [second / first for first, second in zip(alone, scored, strict=True)]
+        print(f"{arguments.model} ({model.backend.name}), {width}x{height}, {describe_hardware()}")
+        print(f"inference alone   {1000 * sum(alone) / count / len(alone):7.1f} ms a frame")
+        print(f"evaluation        {1000 * sum(scored) / count / len(scored):7.1f} ms a frame ({arguments.protocol})")
+        print(
+            f"ratio             {sum(scored) / sum(alone):7.2f} (rounds {', '.join(f'{one:.2f}' for one in ratios)}, "
+            f"median {statistics.median(ratios):.2f})"
+        )
+        print(f"peak memory       {peak_memory():7.0f} MiB (before the rounds {before:.0f})")
+
+
+if __name__ == "__main__":
+    main()
