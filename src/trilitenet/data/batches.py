@@ -7,6 +7,7 @@ import itertools
 from collections.abc import Sequence
 from typing import Final
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -81,7 +82,7 @@ def collate(samples: Sequence[Sample]) -> Batch:
     boxes: list[NDArray[np.float32]] = [np.zeros((0, 6), np.float32)]
     ignored: list[NDArray[np.float32]] = [np.zeros((0, 5), np.float32)]
     for index, sample in enumerate(samples):
-        images[index] = sample.image.transpose(2, 0, 1)
+        cv2.split(sample.image, list(images[index]))
         for target, mask in ((drivable, sample.drivable), (lane, sample.lane)):
             if mask is not None:
                 target[index] = mask

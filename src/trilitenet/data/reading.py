@@ -52,6 +52,9 @@ IMAGE_ENDINGS: Final = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
 
 _IGNORED: Final = 2
 
+_READ_RGB: Final[int | None] = getattr(cv2, "IMREAD_COLOR_RGB", None)
+"""Decode to RGB at once, which OpenCV can from 4.11 on."""
+
 
 class SampleSource(Protocol):
     """Anything that samples can be taken from by index."""
@@ -75,10 +78,10 @@ def decode_image(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8
         DataError: If it is not an image, or a broken one.
     """
     buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes) else data
-    image = cv2.imdecode(buffer, cv2.IMREAD_COLOR) if len(buffer) else None
+    image = cv2.imdecode(buffer, _READ_RGB or cv2.IMREAD_COLOR) if len(buffer) else None
     if image is None:
         raise DataError(f"{name}: not an image that can be decoded; run `trilitenet data check` on the data set")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)  # type: ignore[no-any-return]
+    return np.asarray(image if _READ_RGB else cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image), np.uint8)
 
 
 def decode_mask(
