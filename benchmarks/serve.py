@@ -147,7 +147,7 @@ class Server:
             self.port: int = probe.getsockname()[1]
         command = [str(Path(sys.executable).with_name("trilitenet")), "serve", "--model", arguments.model]
         command += ["--port", str(self.port), "--backend", arguments.backend, "--log-level", "warning"]
-        command += ["--max-batch", str(arguments.max_batch)]
+        command += ["--max-batch", str(arguments.max_batch), "--streams", str(arguments.streams)]
         self._process = subprocess.Popen(command)
         until = time.monotonic() + 120
         while True:
@@ -194,7 +194,7 @@ def pictures(count: int) -> list[bytes]:
 def throughput(arguments: argparse.Namespace) -> None:
     bodies = pictures(8)
     print(f"pictures: {len(bodies)} of 1280x720, {statistics.mean(map(len, bodies)) / 1024:.0f} KiB each")
-    with trilitenet.load(arguments.model, backend=arguments.backend) as predictor:
+    with trilitenet.load(arguments.model, backend=arguments.backend, streams=arguments.streams) as predictor:
         pixels = [read_image(body) for body in bodies]
         predictor(bodies)
         trial = {batch: in_process(predictor, bodies, batch, 2.0) for batch in (1, 2, 4, 8)}
@@ -247,7 +247,8 @@ def main() -> None:
     parser.add_argument("what", choices=["throughput", "overload"])
     parser.add_argument("--model", default="small")
     parser.add_argument("--backend", default="auto")
-    parser.add_argument("--max-batch", type=int, default=8)
+    parser.add_argument("--streams", type=int, default=1)
+    parser.add_argument("--max-batch", type=int, default=0)
     parser.add_argument("--clients", type=int, nargs="+", default=[1, 8, 32])
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--rounds", type=int, default=3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import socket
 import sys
@@ -20,9 +21,10 @@ def serve(
     device: str = "auto",
     backend: str = "auto",
     confidence: float | None = None,
+    streams: int = 1,
     token_file: Path | None = None,
     queue: int = 64,
-    max_batch: int = 8,
+    max_batch: int = 0,
     batch_delay: float = 0.0,
     deadline: float = 10.0,
     max_body: int = 20 * 2**20,
@@ -42,9 +44,11 @@ def serve(
         device: Where the network runs, as for predict.
         backend: The runtime, as for predict.
         confidence: Boxes above this are kept; the model's own threshold if left out.
+        streams: Images that OpenVINO computes at once: more frames a second, more latency.
         token_file: File with the bearer token that clients must bring (or set TRILITENET_TOKEN).
         queue: At most so many images are accepted and not yet answered; one more gets 503.
-        max_batch: At most so many images go through the network at once.
+        max_batch: At most so many images go through the network at once; 0 takes as many as the runtime computes at
+            once: its streams on OpenVINO, 8 on others.
         batch_delay: Seconds that a batch that is not full waits for company.
         deadline: Seconds after which an accepted image that is not through gets 503.
         max_body: Bytes of one request.
@@ -69,7 +73,7 @@ def serve(
         raise ConfigError(f"log_level must be debug, info, warning or error, got {log_level!r}")
     settings = Settings(
         queue=queue,
-        max_batch=max_batch,
+        max_batch=max_batch or Settings.max_batch,
         batch_delay=batch_delay,
         deadline=deadline,
         max_body=max_body,
@@ -83,8 +87,12 @@ def serve(
     cv2.setNumThreads(1)  # images are the unit of parallel work here
     # The network's thread takes Python's lock often and briefly; with the usual 5 ms each other thread delays it.
     sys.setswitchinterval(0.0005)
-    predictor = load(model, device=device, backend=backend, confidence=confidence)
+    predictor = load(model, device=device, backend=backend, confidence=confidence, streams=streams)
     with predictor:
+        if not max_batch:
+            settings = dataclasses.replace(
+                settings, max_batch=getattr(predictor.backend, "streams", settings.max_batch)
+            )
         build_server(create_app(predictor, Path(model).stem, settings)).run([listener])
 
 
