@@ -1,0 +1,247 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.engine.labelled import Images, fake_predictor
+from trilitenet.config import Thresholds
+from trilitenet.data.sample import Sample
+from trilitenet.engine.evaluate import best_thresholds, evaluate, score_predictions
+from trilitenet.engine.predictions import PredictionWriter, SavedPredictions
+from trilitenet.engine.report import Report
+from trilitenet.engine.scorecard import Scorecard
+from trilitenet.errors import ConfigError, DataError
+from trilitenet.structures import Boxes, Perception
+
+
+def values(report: Report) -> dict[str, float]:
+    return {key: figure.value for key, figure in report.figures.items()}
+
+
+def test_a_perfect_predictor_scores_one() -> None:
+    images = Images()
+    report = evaluate(fake_predictor(images), images, resamples=50)
+    assert report.fair is not None
+    assert report.fair.drivable is not None
+    assert report.fair.detection is not None
+    assert report.fair.lane is not None
+    assert report.fair.drivable.miou == 1.0
+    assert report.fair.lane.as_labelled.iou == 1.0
+    assert report.fair.lane.boundary_f == {1: 1.0, 2: 1.0, 5: 1.0}
+    assert report.fair.detection.ap50 == pytest.approx(1.0)
+    assert report.fair.detection.at.f1 == 1.0
+    assert report.fair.detection.at.confidence == 0.3
+    assert report.paper is None
+    figure = report.figures["fair/drivable/miou"]
+    assert (figure.value, figure.low, figure.high) == (1.0, 1.0, 1.0)
+
+
+def test_a_drifting_predictor_scores_less_and_its_interval_holds_the_value() -> None:
+    images = Images()
+    report = evaluate(fake_predictor(images, drift=3), images, protocol="both", resamples=200)
+    for key, figure in report.figures.items():
+        assert figure.low is not None
+        assert figure.high is not None
+        assert figure.low - 1e-9 <= figure.value <= figure.high + 1e-9, key
+    assert report.figures["fair/lane/iou"].value == pytest.approx(1 / 7)
+    assert report.protocols == ("fair", "paper")
+
+
+@pytest.mark.parametrize("protocol", ["fair", "paper"])
+def test_figures_do_not_hang_on_the_batch_size(protocol: str) -> None:
+    images = Images()
+    one = fake_predictor(images, drift=2)
+    several = fake_predictor(images, drift=2)
+    first = evaluate(one, images, protocol=protocol, resamples=0)
+    second = evaluate(several, images, protocol=protocol, resamples=0, batch_size=2)
+    assert values(first) == values(second)
+    assert set(one.backend.batches) == {1}
+    assert max(several.backend.batches) == 2  # neighbours of one size share a batch
+    assert sum(several.backend.batches) == len(images)
+
+
+def test_predictions_are_handed_on_in_order_at_the_images_own_size() -> None:
+    images = Images()
+    seen: list[str] = []
+
+    def look(sample: object, prediction: Perception) -> None:
+        assert isinstance(sample, Sample)
+        assert prediction.size == sample.size
+        seen.append(sample.name)
+
+    evaluate(fake_predictor(images), images, resamples=0, limit=7, on_prediction=look)
+    assert seen == [f"{index:03d}" for index in range(7)]
+
+
+def test_the_image_is_changed_for_the_network_alone() -> None:
+    images = Images()
+    report = evaluate(
+        fake_predictor(images), images, resamples=0, change=lambda image, name: image // np.array([4, 1, 1], np.uint8)
+    )
+    assert values(report)["fair/drivable/iou"] == 0.0
+    assert values(report)["fair/lane/iou"] == 1.0
+
+
+def test_conditions_hold_their_own_images() -> None:
+    images = Images()
+    report = evaluate(fake_predictor(images, drift=2), images, resamples=0)
+    assert [(row.attribute, row.value, row.images) for row in report.conditions] == [
+        ("timeofday", "daytime", 9),
+        ("timeofday", "night", 3),
+    ]  # the scene is undefined everywhere, weather is not there
+    assert all(row.few for row in report.conditions)
+    night = Images()
+    night._samples = [sample for sample in night._samples if sample.attributes["timeofday"] == "night"]
+    alone = evaluate(fake_predictor(images, drift=2), night, resamples=0)
+    assert report.conditions[1].figures == pytest.approx(values(alone))
+
+
+def test_the_worst_images_are_kept_with_a_picture() -> None:
+    images = Images()
+    report = evaluate(fake_predictor(images, drift=4), images, resamples=0, worst=3)
+    for task in ("detection", "drivable", "lane"):
+        frames = [frame for frame in report.worst if frame.task == task]
+        assert len(frames) == 3
+        assert [frame.score for frame in frames] == sorted(frame.score for frame in frames)
+        assert all(frame.picture.startswith(b"\xff\xd8") for frame in frames)
+    assert evaluate(fake_predictor(images), images, resamples=0, worst=0).worst == ()
+
+
+def test_saved_predictions_score_as_the_predictor_did(tmp_path: Path) -> None:
+    images = Images()
+    predictor = fake_predictor(images, drift=2)
+    with PredictionWriter(tmp_path, ("detection", "drivable", "lane")) as writer:
+        report = evaluate(
+            predictor,
+            images,
+            resamples=0,
+            on_prediction=lambda sample, prediction: writer.write(sample.name, prediction),
+        )
+    saved = score_predictions(SavedPredictions(tmp_path, ("vehicle",)), images, confidence=0.3, resamples=0)
+    assert values(saved) == pytest.approx(values(report), abs=1e-9)
+    assert saved.provenance.runtime == "saved predictions"
+    both = score_predictions(SavedPredictions(tmp_path, ("vehicle",)), images, protocol="both", resamples=0)
+    assert values(both)["paper/drivable/miou"] > 0.8
+
+
+def test_predictions_of_other_images_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "detections.json").write_text(
+        json.dumps([{"image_id": "x", "category_id": 1, "bbox": [0, 0, 2, 2], "score": 0.5}])
+    )
+    with pytest.raises(DataError, match="for none of the 12 images"):
+        score_predictions(SavedPredictions(tmp_path, ("vehicle",)), Images())
+
+
+def test_the_best_thresholds_are_found_in_one_pass() -> None:
+    images = Images()
+    predictor = fake_predictor(images)
+    run = predictor.backend.run
+
+    def unsure(batch: np.ndarray) -> object:
+        raw = run(batch)
+        assert raw.drivable is not None
+        assert raw.lane is not None
+        # Drivable 80 inside and 60 outside, lane 200 inside and 180 outside: the cuts lie between.
+        return dataclasses.replace(
+            raw,
+            drivable=np.where(raw.drivable == 255, 80, 60).astype(np.uint8),
+            lane=np.where(raw.lane == 255, 200, 180).astype(np.uint8),
+        )
+
+    predictor.backend.run = unsure  # type: ignore[method-assign,assignment]
+    best = best_thresholds(predictor, images)
+    assert 60 / 255 < best.thresholds.drivable < 80 / 255
+    assert 180 / 255 < best.thresholds.lane < 200 / 255
+    assert 0.09 < best.thresholds.confidence < 0.81
+    assert (best.drivable_iou, best.lane_iou, best.detection_f1) == (1.0, 1.0, 1.0)
+    predictor.thresholds = best.thresholds
+    assert values(evaluate(predictor, images, resamples=0))["fair/drivable/iou"] == 1.0
+
+
+def test_without_labels_thresholds_stay() -> None:
+    images = Images(3)
+    images._samples = [
+        dataclasses.replace(sample, boxes=None, class_id=None, drivable=None, lane=None) for sample in images._samples
+    ]
+    best = best_thresholds(fake_predictor(images), _WithBoxes(images))
+    assert best.thresholds == Thresholds(confidence=0.3)
+    assert np.isnan([best.detection_f1, best.drivable_iou, best.lane_iou]).all()
+
+
+class _WithBoxes:
+    """Images without labels, for a fake backend that looks boxes up elsewhere."""
+
+    class_names = ("vehicle",)
+
+    def __init__(self, images: Images) -> None:
+        self._blank = list(images._samples)
+        images._samples = Images(3)._samples
+
+    def __len__(self) -> int:
+        return len(self._blank)
+
+    def __getitem__(self, index: int) -> Sample:
+        return self._blank[index]
+
+
+def test_what_cannot_be_evaluated_is_refused() -> None:
+    images = Images()
+    predictor = fake_predictor(images)
+    with pytest.raises(ConfigError, match="unknown protocol 'unfair'"):
+        evaluate(predictor, images, protocol="unfair")
+    with pytest.raises(DataError, match="no images"):
+        evaluate(predictor, images, limit=0)
+    images.class_names = ("car", "bus")
+    with pytest.raises(ConfigError, match="the model has classes vehicle, the labels car, bus"):
+        evaluate(predictor, images)
+
+
+def test_an_error_while_reading_is_the_callers() -> None:
+    class Broken(Images):
+        def __getitem__(self, index: int) -> Sample:
+            if index == 5:
+                raise DataError("005.jpg: broken")
+            return super().__getitem__(index)
+
+    with pytest.raises(DataError, match=r"005\.jpg: broken"):
+        evaluate(fake_predictor(Images()), Broken(), resamples=0)
+
+
+def test_memory_grows_by_little_more_than_counts() -> None:
+    rng = np.random.default_rng(0)
+    card = Scorecard(("vehicle",), ("detection", "drivable", "lane"), protocol="fair", worst=4)
+    mask = np.zeros((64, 64), np.uint8)
+    mask[30:34] = 1
+
+    def add(index: int) -> None:
+        boxes = rng.uniform(0, 50, (20, 4)).astype(np.float32)
+        boxes[:, 2:] += boxes[:, :2]
+        sample = Sample(
+            name=f"{index}",
+            image=np.zeros((64, 64, 3), np.uint8),
+            boxes=boxes[:3],
+            class_id=np.zeros(3, np.int64),
+            drivable=mask,
+            lane=mask,
+        )
+        scores = np.sort(rng.random(20).astype(np.float32))[::-1]
+        predicted = Perception(
+            (64, 64), boxes=Boxes(boxes, scores, np.zeros(20, np.int64)), drivable=mask > 0, lane=mask > 0
+        )
+        card.add(sample, predicted, None)
+
+    for index in range(100):
+        add(index)
+    tracemalloc.start()
+    before = tracemalloc.get_traced_memory()[0]
+    for index in range(100, 500):
+        add(index)
+    grown = tracemalloc.get_traced_memory()[0] - before
+    tracemalloc.stop()
+    # An image of 64x64 with its labels takes 20 kB; what stays of it is counts and 20 boxes of about 30 bytes.
+    assert grown / 400 < 3000

@@ -1,0 +1,126 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from trilitenet.engine.predictions import PredictionWriter, SavedPredictions
+from trilitenet.errors import DataError, OutputError
+from trilitenet.structures import Boxes, Perception
+
+
+def perception(rng: np.random.Generator, boxes: int) -> Perception:
+    low = rng.uniform(0, 20, (boxes, 2))
+    return Perception(
+        (40, 50),
+        ("car", "bus"),
+        Boxes(
+            np.concatenate([low, low + 9], axis=1).astype(np.float32),
+            np.sort(rng.random(boxes).astype(np.float32))[::-1],
+            rng.integers(0, 2, boxes),
+        ),
+        rng.random((40, 50)) < 0.5,
+        rng.random((40, 50)) < 0.1,
+    )
+
+
+def test_what_is_written_is_read_again(tmp_path: Path, rng: np.random.Generator) -> None:
+    written = {f"image {index}": perception(rng, index) for index in range(4)}
+    with PredictionWriter(tmp_path, ("detection", "drivable", "lane")) as writer:
+        for name, one in written.items():
+            writer.write(name, one)
+    saved = SavedPredictions(tmp_path, ("car", "bus"))
+    assert saved.tasks == ("detection", "drivable", "lane")
+    assert saved.names == {"image 1", "image 2", "image 3"}  # the first has no boxes
+    for name, one in written.items():
+        again = saved.get(name, (40, 50))
+        assert again.boxes is not None
+        assert one.boxes is not None
+        np.testing.assert_allclose(again.boxes.xyxy, one.boxes.xyxy, atol=1e-3)
+        np.testing.assert_allclose(again.boxes.confidence, one.boxes.confidence, rtol=1e-6)
+        assert (again.boxes.class_id == one.boxes.class_id).all()
+        assert (again.drivable == one.drivable).all()
+        assert (again.lane == one.lane).all()
+
+
+def test_the_form_on_disk(tmp_path: Path) -> None:
+    one = Perception(
+        (2, 3),
+        boxes=Boxes(np.array([[1, 2, 4, 7]], np.float32), np.array([0.5], np.float32), np.zeros(1, np.int64)),
+        lane=np.eye(2, 3, dtype=np.bool_),
+    )
+    with PredictionWriter(tmp_path, ("detection", "lane")) as writer:
+        writer.write("a", one)
+    assert json.loads((tmp_path / "detections.json").read_text()) == [
+        {"image_id": "a", "category_id": 1, "bbox": [1.0, 2.0, 3.0, 5.0], "score": 0.5}
+    ]
+    assert cv2.imread(str(tmp_path / "lane" / "a.png"), cv2.IMREAD_UNCHANGED).tolist() == [[255, 0, 0], [0, 255, 0]]
+    assert not (tmp_path / "drivable").exists()
+
+
+def test_predictions_are_not_overwritten_unasked(tmp_path: Path) -> None:
+    PredictionWriter(tmp_path, ("detection",)).close()
+    assert json.loads((tmp_path / "detections.json").read_text()) == []
+    with pytest.raises(OutputError, match="--overwrite"):
+        PredictionWriter(tmp_path, ("detection",))
+    PredictionWriter(tmp_path, ("detection",), overwrite=True).close()
+
+
+def test_a_part_that_is_not_there_is_a_task_that_is_not_scored(tmp_path: Path) -> None:
+    (tmp_path / "lane").mkdir()
+    cv2.imwrite(str(tmp_path / "lane" / "a.png"), np.full((4, 4), 7, np.uint8))
+    saved = SavedPredictions(tmp_path, ("vehicle",))
+    one = saved.get("a", (4, 4))
+    assert saved.tasks == ("lane",)
+    assert one.boxes is None
+    assert one.drivable is None
+    assert one.lane is not None
+    assert one.lane.all()  # anything above 0
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{}", "not COCO results"),
+        ("[1]", "not COCO results"),
+        ('[{"image_id": "a"}]', "not COCO results"),
+        ('[{"image_id": "a", "category_id": 1, "bbox": [0, 0, 1], "score": 0.5}]', "not COCO results"),
+        ('[{"image_id": "a", "category_id": 1, "bbox": [0, 0, 1, 1], "score": 50}]', "between 0 and 1"),
+        ('[{"image_id": "a", "category_id": 3, "bbox": [0, 0, 1, 1], "score": 0.5}]', "category_id 3 is not 1 to 2"),
+        ("[{", "not COCO results"),
+        ("", "not COCO results"),
+    ],
+)
+def test_broken_detections_are_told_in_a_line(tmp_path: Path, content: str, message: str) -> None:
+    (tmp_path / "detections.json").write_text(content)
+    with pytest.raises(DataError, match=message):
+        SavedPredictions(tmp_path, ("car", "bus"))
+
+
+def test_masks_must_be_there_and_fit(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no predictions"):
+        SavedPredictions(tmp_path, ("vehicle",))
+    (tmp_path / "lane").mkdir()
+    saved = SavedPredictions(tmp_path, ("vehicle",))
+    with pytest.raises(DataError, match="missing"):
+        saved.get("a", (4, 4))
+    (tmp_path / "lane" / "a.png").write_bytes(b"")
+    with pytest.raises(DataError, match="decoded"):
+        saved.get("a", (4, 4))
+    cv2.imwrite(str(tmp_path / "lane" / "a.png"), np.zeros((4, 5), np.uint8))
+    with pytest.raises(DataError, match="5x4, the image is 4x4"):
+        saved.get("a", (4, 4))
+
+
+def test_with_one_class_any_category_is_it(tmp_path: Path) -> None:
+    (tmp_path / "detections.json").write_text(
+        '[{"image_id": 7, "category_id": 3, "bbox": [0, 0, 1, 1], "score": 0.1},'
+        ' {"image_id": 7, "category_id": 1, "bbox": [0, 0, 2, 2], "score": 0.4}]'
+    )
+    boxes = SavedPredictions(tmp_path, ("vehicle",)).get("7", (4, 4)).boxes
+    assert boxes is not None
+    assert boxes.class_id.tolist() == [0, 0]
+    assert boxes.confidence.tolist() == pytest.approx([0.4, 0.1])  # best first

@@ -1,0 +1,195 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.engine.labelled import Images, fake_predictor
+from trilitenet.engine.compare import compare_reports
+from trilitenet.engine.evaluate import evaluate
+from trilitenet.engine.figures import FIGURES
+from trilitenet.engine.page import percent
+from trilitenet.engine.published_rows import PUBLISHED_ROWS
+from trilitenet.engine.report import Report, read_report
+from trilitenet.engine.robustness import CORRUPTED, corrupted_figures, figures_by_size
+from trilitenet.errors import ConfigError, DataError, OutputError
+
+
+@pytest.fixture(scope="module")
+def report() -> Report:
+    images = Images(40)
+    about = {"model": "m<1>.onnx", "data": "d", "split": "val", "data_sha256": {"images": "ab"}}
+    return evaluate(fake_predictor(images, drift=2), images, protocol="both", resamples=60, worst=2, about=about)
+
+
+def test_the_json_form_holds_everything_but_pictures(report: Report, tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "report.json"
+    report.save_json(path)
+    mapping = json.loads(path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    assert mapping["schema"] == 1
+    assert set(mapping["provenance"]) >= {"model", "model_sha256", "data_sha256", "thresholds", "versions", "hardware"}
+    again = read_report(path)
+    assert str(again.fair) == str(report.fair)
+    assert str(again.paper) == str(report.paper)
+    assert again.figures == report.figures
+    assert again.conditions == report.conditions
+    assert again.plots == report.plots
+    assert again.provenance == report.provenance
+    assert [dataclasses.replace(frame, picture=b"") for frame in report.worst] == list(again.worst)
+
+
+def test_every_figure_has_a_formula(report: Report) -> None:
+    assert set(report.figures) <= set(FIGURES)
+    assert all(FIGURES[key].formula for key in report.figures)
+
+
+def test_the_page_is_self_contained_and_escaped(report: Report, tmp_path: Path) -> None:
+    report.save_html(tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    assert "m&lt;1&gt;.onnx" in text
+    assert "m<1>" not in text
+    assert not re.search(r"(src|href)=\"(?!data:)", text)
+    assert "<script" not in text
+    assert text.count("data:image/jpeg;base64,") == 6  # two a task
+    assert "Worst images: lane" in text
+    assert re.search(r"<tr class=few><td>night", text)
+    assert "$" not in text  # no placeholder left
+    for tag in ("table", "div", "section", "figure", "svg", "tr", "td"):
+        assert len(re.findall(f"<{tag}[ >]", text)) == text.count(f"</{tag}>"), tag
+
+
+def test_the_terminal_form_names_every_figure(report: Report) -> None:
+    text = report.summary()
+    assert "fair protocol" in text
+    assert "paper protocol" in text
+    assert "95% interval" in text
+    assert f"{percent(report.figures['fair/drivable/miou'].value)} " in text
+    assert re.search(r"night +10 +\(", text)  # few images stand in brackets
+    assert "\x1b" not in text  # no colours into a pipe
+    assert max(map(len, text.splitlines())) <= 120
+
+
+def test_what_is_no_report_is_refused(tmp_path: Path, report: Report) -> None:
+    path = tmp_path / "report.json"
+    with pytest.raises(DataError, match="cannot be read"):
+        read_report(path)
+    for content in ("", "[]", "{}", '{"schema": 1}'):
+        path.write_text(content)
+        with pytest.raises(DataError, match="not a report"):
+            read_report(path)
+    path.write_text(json.dumps(report.to_dict() | {"schema": 99}))
+    with pytest.raises(DataError, match="newer"):
+        read_report(path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot be written"):
+        report.save_json(tmp_path / "file" / "report.json")
+
+
+def test_a_model_does_not_differ_from_itself(report: Report) -> None:
+    comparison = compare_reports({"a": report, "b": report}, resamples=50)
+    assert len(comparison.differences) == len(report.figures)
+    assert all(one.value == 0 and not one.real for one in comparison.differences)
+
+
+def test_real_differences_are_told_from_chance(report: Report) -> None:
+    images = Images(40)
+    better = evaluate(fake_predictor(images), images, protocol="both", resamples=0)
+    comparison = compare_reports({"drifting": report, "exact": better}, resamples=200)
+    lane = comparison.difference("exact", "fair/lane/iou")
+    assert lane is not None
+    assert lane.real
+    assert lane.low <= lane.value <= lane.high
+    assert lane.low > 0
+    # The same images are drawn for both, so the difference is surer than the two intervals would tell.
+    apart = report.figures["fair/drivable/iou"]
+    together = comparison.difference("exact", "fair/drivable/iou")
+    assert together is not None
+    assert apart.high is not None
+    assert apart.low is not None
+    assert together.high - together.low <= apart.high - apart.low + 1e-9
+    text = comparison.summary()
+    assert "exact" in text
+    assert "*" in text
+
+
+def test_reports_of_other_images_or_labels_are_not_paired(report: Report) -> None:
+    images = Images(12)
+    other = evaluate(fake_predictor(images), images, resamples=0)
+    relabelled = dataclasses.replace(
+        report, provenance=dataclasses.replace(report.provenance, data_sha256={"images": "cd"})
+    )
+    comparison = compare_reports({"a": report, "b": other, "c": relabelled}, resamples=10)
+    assert not comparison.differences
+    assert "other images" in comparison.unpaired["b"]
+    assert "other images under the same names" in comparison.unpaired["c"]
+    with pytest.raises(ConfigError, match="at least one"):
+        compare_reports({})
+
+
+def test_published_rows_stand_beside_with_their_protocol(report: Report, tmp_path: Path) -> None:
+    comparison = compare_reports({"mine": report}, published=True, resamples=10)
+    text = comparison.summary()
+    assert "YOLOPX" in text
+    assert "recall at confidence 0.001" in text
+    comparison.save(tmp_path)
+    mapping = json.loads((tmp_path / "comparison.json").read_text())
+    assert len(mapping["published"]) == len(PUBLISHED_ROWS)
+    assert all(row["protocol"] for row in mapping["published"])
+    assert "A-YOLOM (n)" in (tmp_path / "comparison.html").read_text()
+
+
+def test_published_rows_are_those_of_the_paper() -> None:
+    rows = {row.name: row for row in PUBLISHED_ROWS}
+    base = rows["TriLiteNet base"]
+    assert (base.recall, base.map50, base.miou, base.acc, base.iou) == (85.6, 72.3, 92.4, 82.3, 29.8)
+    # The slip in the table of cost (n and s swapped) is not in the table of comparison.
+    assert (rows["A-YOLOM (n)"].parameters, rows["A-YOLOM (s)"].parameters) == (4.43, 13.61)
+    assert rows["YOLOPv2"].printed == ["91.1", "83.4", "93.2", "-", "27.25"]
+    assert rows["TriLiteNet tiny"].figures["paper/lane/iou"] == pytest.approx(0.242)
+    assert len(rows) == len(PUBLISHED_ROWS)
+
+
+def test_corruptions_are_measured_and_averaged() -> None:
+    images = Images(6)
+    predictor = fake_predictor(images)
+    clean = evaluate(predictor, images, resamples=0)
+    passes: list[str] = []
+    rows = corrupted_figures(
+        predictor, images, clean, corruptions=("contrast", "pixelate"), severities=(1, 5), progress=passes.append
+    )
+    assert passes == ["contrast 1", "contrast 5", "pixelate 1", "pixelate 5"]
+    shown = {row.name: row.figures for row in rows if not row.detail}
+    detail = {row.name: row.figures for row in rows if row.detail}
+    key = "fair/drivable/miou"
+    assert list(shown) == ["clean", "contrast", "pixelate", "mean of corruptions", "mean corruption drop"]
+    assert shown["contrast"][key] == pytest.approx((detail["contrast 1"][key] + detail["contrast 5"][key]) / 2)
+    mean = (shown["contrast"][key] + shown["pixelate"][key]) / 2
+    assert shown["mean corruption drop"][key] == pytest.approx(1.0 - mean)
+    varied = dataclasses.replace(clean, variations=rows)
+    assert CORRUPTED in varied.summary()
+    assert all(row.kind == CORRUPTED for row in rows)
+
+
+def test_input_sizes_are_swept(tmp_path: Path) -> None:
+    images = Images(4)
+    sizes = {96: fake_predictor(images), 192: fake_predictor(images)}
+    sizes[192].long_side = 192
+    # The fake network knows boxes at 96 pixels only.
+    rows = figures_by_size(sizes, images)
+    assert [row.name for row in rows] == ["96", "192"]
+    assert rows[0].figures["fair/drivable/miou"] == 1.0
+    assert rows[1].figures["fair/drivable/miou"] > 0.95
+    report = dataclasses.replace(evaluate(sizes[96], images, resamples=0), variations=rows)
+    report.save_json(tmp_path / "report.json")
+    report.save_html(tmp_path / "report.html")
+    assert read_report(tmp_path / "report.json").variations == rows
+    assert "Input sizes" in (tmp_path / "report.html").read_text()
+
+
+def test_undefined_figures_are_a_dash() -> None:
+    assert percent(float("nan")) == percent(None) == "-"
+    assert percent(np.float64(0.1234)) == "12.3"
