@@ -245,10 +245,11 @@ def test_gradients_are_finite_and_right() -> None:
 
     def box_and_class(*levels: Tensor) -> Tensor:
         terms = loss(levels, boxes, ignored, labelled)
-        return terms.classification + terms.objectness.detach() * 0
+        total: Tensor = terms.classification + terms.objectness.detach() * 0
+        return total
 
     assert torch.autograd.gradcheck(box_and_class, leaves, fast_mode=True)
-    sum(loss(leaves, boxes, ignored, labelled)).backward()  # type: ignore[union-attr]
+    sum(loss(leaves, boxes, ignored, labelled)).backward()
     assert all(leaf.grad is not None and bool(leaf.grad.isfinite().all()) for leaf in leaves)
 
 

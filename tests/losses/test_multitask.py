@@ -97,6 +97,6 @@ def test_uncertainty_weighting_starts_as_the_fixed_sum_and_learns() -> None:
     torch.testing.assert_close(terms.total, fixed.total)
     terms.total.backward()
     (parameter,) = loss.parameters()
-    expected = 1 - torch.stack([sum(fixed[1:4]), sum(fixed[4:6]), sum(fixed[6:8])])  # type: ignore[list-item]
+    expected = 1 - torch.stack([sum(fixed[1:4]), sum(fixed[4:6]), sum(fixed[6:8])])
     torch.testing.assert_close(parameter.grad, expected)
     assert not list(MultiTaskLoss(DetectionLoss(ANCHORS, 1)).parameters())

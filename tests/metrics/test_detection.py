@@ -19,7 +19,7 @@ NO_CLASS = np.zeros(0, np.int64)
 
 def random_boxes(rng: np.random.Generator, count: int) -> np.ndarray:
     low = rng.uniform(0, 400, (count, 2))
-    return np.concatenate([low, low + rng.uniform(4, 160, (count, 2))], axis=1).round(2)
+    return np.asarray(np.concatenate([low, low + rng.uniform(4, 160, (count, 2))], axis=1).round(2))
 
 
 def random_images(rng: np.random.Generator, count: int, classes: int) -> list[dict[str, np.ndarray]]:

@@ -129,7 +129,8 @@ class AttentionGraph(nn.Module):
         total = F.leaky_relu(torch.matmul(total, self.channels) + self.fuse_bias, self.fuse_slope)
         values = torch.matmul(total, self.value) + self.value_bias
         affinity = F.softmax(torch.matmul(pixels, keys.transpose(2, 3)) + bias, -1)  # (B, bins, R, K)
-        return x + self.act(self.merge(torch.matmul(affinity, values), height, width))
+        out: Tensor = x + self.act(self.merge(torch.matmul(affinity, values), height, width))
+        return out
 
 
 class DetectionGraph(nn.Module):

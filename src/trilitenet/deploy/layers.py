@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -20,8 +21,7 @@ from trilitenet.deploy.rewrites import (
     prelu_slopes,
     space_to_depth_kernel,
 )
-from trilitenet.models.blocks import ConvBNPReLU, DepthwiseESP, StrideESP
-from trilitenet.models.detection import DepthwiseSeparableConv
+from trilitenet.models.blocks import ConvBNPReLU, DepthwiseESP, DepthwiseSeparableConv, StrideESP
 
 __all__ = [
     "Activation",
@@ -118,7 +118,8 @@ class FusedTransposedConv(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, C, H, W) to (B, out, 2H, 2W)."""
-        return self.act(F.conv_transpose2d(x, self.weight, self.bias, 2))
+        out: Tensor = self.act(F.conv_transpose2d(x, self.weight, self.bias, 2))
+        return out
 
 
 def fold_block(block: ConvBNPReLU) -> tuple[Kernel, Tensor]:
@@ -135,7 +136,7 @@ def depth_to_space(x: Tensor, block: int) -> Tensor:
     batch, channels, height, width = x.shape
     shape = (batch, channels // block**2, height * block, width * block)
     if torch.onnx.is_in_onnx_export():
-        attributes = {"blocksize": block, "mode": "DCR"}
+        attributes: dict[str, Any] = {"blocksize": block, "mode": "DCR"}
         return torch.onnx.ops.symbolic("DepthToSpace", (x,), attributes, dtype=x.dtype, shape=shape, version=13)
     return x.view(batch, block, block, shape[1], height, width).permute(0, 3, 4, 1, 5, 2).reshape(shape)
 

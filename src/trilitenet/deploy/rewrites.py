@@ -148,7 +148,8 @@ def hierarchical_sum_matrix(first: int, branch: int) -> Tensor:
         (first + 4 branch, first + 4 branch) float64.
     """
     lower = torch.kron(torch.ones(4, 4, dtype=torch.float64).tril(), torch.eye(branch, dtype=torch.float64))
-    return torch.block_diag(torch.eye(first, dtype=torch.float64), lower)
+    matrix: Tensor = torch.block_diag(torch.eye(first, dtype=torch.float64), lower)
+    return matrix
 
 
 def join_outputs(*kernels: Kernel) -> Kernel:

@@ -90,7 +90,7 @@ def keep_frozen(network: nn.Module, parts: Sequence[str]) -> None:
 
 
 def _part(network: nn.Module, name: str) -> nn.Module:
-    modules = dict(network.named_modules())
+    modules: dict[str, nn.Module] = dict(network.named_modules())
     if not name or name not in modules:
         raise ConfigError(f"no part {name!r} to freeze{did_you_mean(name, [n for n in modules if n])}")
     return modules[name]

@@ -89,4 +89,4 @@ def _probability(mask: NDArray[Any], info: ArtefactInfo) -> NDArray[np.uint8]:
     if info.masks == "probability":
         return np.asarray(mask, np.uint8)
     decided = mask if info.masks == "decision" else (mask > 0).astype(np.uint8)
-    return np.multiply(decided, np.uint8(255), dtype=np.uint8)
+    return np.asarray(np.multiply(decided, np.uint8(255), dtype=np.uint8))

@@ -45,7 +45,8 @@ def focal_loss(logits: Tensor, target: Tensor, alpha: float = 0.25, gamma: float
     Raises:
         ShapeError: If the shapes do not fit.
     """
-    return SegmentationLoss(0.5, 0.5, focal_alpha=alpha, focal_gamma=gamma)(logits, target).focal
+    terms: SegmentationTerms = SegmentationLoss(0.5, 0.5, focal_alpha=alpha, focal_gamma=gamma)(logits, target)
+    return terms.focal
 
 
 def tversky_loss(logits: Tensor, target: Tensor, alpha: float = 0.7, beta: float = 0.3, gamma: float = 4 / 3) -> Tensor:
@@ -64,7 +65,8 @@ def tversky_loss(logits: Tensor, target: Tensor, alpha: float = 0.7, beta: float
     Raises:
         ShapeError: If the shapes do not fit.
     """
-    return SegmentationLoss(alpha, beta, tversky_gamma=gamma)(logits, target).tversky
+    terms: SegmentationTerms = SegmentationLoss(alpha, beta, tversky_gamma=gamma)(logits, target)
+    return terms.tversky
 
 
 class SegmentationLoss(nn.Module):

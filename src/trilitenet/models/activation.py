@@ -48,7 +48,7 @@ def _by_rows(x: Tensor) -> bool:
         x.device.type == "cpu"
         and x.ndim == 4
         and torch.is_grad_enabled()
-        and not torch.jit.is_tracing()
+        and not torch.jit.is_tracing()  # type: ignore[attr-defined]
         and not torch.compiler.is_compiling()
         and x.is_contiguous(memory_format=torch.channels_last)
     )
