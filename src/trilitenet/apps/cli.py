@@ -61,6 +61,7 @@ class Command(NamedTuple):
 
 
 COMMANDS: Final[tuple[Command, ...]] = (
+    Command("benchmark", "benchmark", "benchmark"),
     Command("compare", "compare", "compare"),
     Command("data check", "data", "check"),
     Command("data convert", "data", "convert"),
@@ -68,6 +69,7 @@ COMMANDS: Final[tuple[Command, ...]] = (
     Command("data show", "data", "show"),
     Command("data synthesize", "synthesize", "synthesize"),
     Command("evaluate", "evaluate", "evaluate"),
+    Command("export", "export", "export"),
     Command("predict", "predict", "predict"),
     Command("score", "score", "score"),
     Command("serve", "command", "serve", package="apps.server"),
@@ -103,12 +105,13 @@ def build_app(words: Sequence[str] = (), *, everything: bool = False) -> cyclopt
         suppress_keyboard_interrupt=False,
     )
     groups = {name: cyclopts.App(name=name, help=text) for name, text in GROUPS.items()}
+    called = next((c for c in COMMANDS if list(words[: len(c.words.split())]) == c.words.split()), None)
     for command in COMMANDS:
         parts = command.words.split()
         parent = groups[parts[0]] if len(parts) == 2 else app
-        if everything or list(words[: len(parts)]) == parts:
+        if everything or command is called:
             parent.command(command.load(), name=parts[-1])
-        elif not words or words[0].startswith("-") or list(words[: len(parts) - 1]) == parts[:-1]:
+        elif called is None:
             parent.command(_placeholder, name=parts[-1], help=command.read_summary())
     for group in groups.values():
         if any(not name.startswith("-") for name in group):

@@ -20,8 +20,8 @@ class Tolerance:
 
     Attributes:
         pixels: Least share of mask pixels that agree.
-        boxes: Least share of the network's confident boxes that the artefact has too (IoU of at least 0.9), and the
-            reverse.
+        boxes: Least share of the network's confident boxes that the artefact has too (IoU of at least 0.9, or
+            sides less than half a pixel apart), and the reverse.
     """
 
     pixels: float
@@ -74,6 +74,9 @@ class Parity:
             parts.append(f"boxes in both {self.boxes:.4f} (sides {self.box_error:.2f} px apart)")
         return "parity: " + ", ".join(parts)
 
+LIMIT: Final = 300
+"""At most so many boxes of a frame are looked for, the most confident."""
+
 
 def compare(
     reference: Callable[[NDArray[np.uint8]], RawOutputs],
@@ -103,8 +106,8 @@ def compare(
             wanted, mask = getattr(expected, name), getattr(got, name)
             if wanted is not None:
                 scale = mask.shape[1] // wanted.shape[1]
-                if scale > 1:  # the middle of each enlarged pixel stands for it
-                    continue
+                if scale > 1:  # an enlarged mask is compared by the mean of each block
+                    mask = _shrink(mask, scale)
                 limit = int(threshold * 255)
                 equal[name].append(float(np.mean((wanted[0] > limit) == (mask[0] > limit))))
         if expected.detection is not None and got.detection is not None:
@@ -122,6 +125,13 @@ def compare(
     )
 
 
+def _shrink(mask: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
+    """Return the mean of blocks of an enlarged mask."""
+    batch, height, width = mask.shape
+    blocks = mask.reshape(batch, height // scale, scale, width // scale, scale)
+    return np.asarray(blocks.mean((2, 4)).round(), np.uint8)
+
+
 def _both(
     one: NDArray[np.float32], other: NDArray[np.float32]
 ) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
@@ -136,7 +146,9 @@ def _match(
     A row must be clearly above the threshold on one side, and need only be near it on the other: rows at the very
     threshold are decided by rounding.
     """
-    sure = wanted[wanted[:, 4] * wanted[:, 5:].max(1) > confidence + 0.05]
+    scores = wanted[:, 4] * wanted[:, 5:].max(1)
+    best = np.argsort(-scores, kind="stable")[:LIMIT]
+    sure = wanted[best[scores[best] > confidence + 0.05]]
     near = offered[offered[:, 4] * offered[:, 5:].max(1) > confidence - 0.05]
     if not len(sure) or not len(near):
         return 0, len(sure), []
@@ -145,6 +157,8 @@ def _match(
     shared = overlap.prod(2)
     areas = sure[:, 2:4].prod(1)[:, None] + near[:, 2:4].prod(1)[None] - shared
     iou = shared / np.maximum(areas, 1e-9)
-    best = iou.argmax(1)
-    good = iou[np.arange(len(sure)), best] >= 0.9
-    return int(good.sum()), len(sure), np.abs(a - b[best]).mean(1)[good].tolist()
+    nearest = iou.argmax(1)
+    sides = np.abs(a[:, None] - b[None]).max(2)
+    good = (iou.max(1) >= 0.9) | (sides.min(1) < 0.5)  # specks have no meaningful IoU
+    nearest = np.where(iou.max(1) >= 0.9, nearest, sides.argmin(1))
+    return int(good.sum()), len(sure), np.abs(a - b[nearest]).mean(1)[good].tolist()

@@ -1,0 +1,214 @@
+"""The deploy graph against the same network exported plainly, and against eager PyTorch, in one interleaved run.
+
+    python benchmarks/speed.py --variant tiny small base --rounds 30
+    python benchmarks/speed.py --variant tiny --threads 1 --cpu-time   # a busy machine: processor time, not wall time
+
+'Plain' is the network as it is, traced to ONNX with float input and logits out: no decoding, no thresholds. 'Deploy'
+takes pixels and gives decoded boxes and decided masks. Weights are random unless --weights names files; times hardly
+depend on them. Ratios are medians over the rounds of plain time / own time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import openvino as ov
+import torch
+
+from trilitenet.config import ArtefactInfo, Thresholds
+from trilitenet.deploy.graph import DeployGraph
+from trilitenet.deploy.layouts import LAYOUTS, pick_layout
+from trilitenet.deploy.onnx import build_onnx
+from trilitenet.deploy.openvino import build_openvino, has_amx, save_openvino
+from trilitenet.deploy.quantize import KEEP_STEPS, quantize_openvino
+from trilitenet.inference.openvino_backend import OpenVINOBackend
+from trilitenet.inference.predictor import Predictor
+from trilitenet.models.trilitenet import TriLiteNet, build_network, normalise_images
+from trilitenet.processing.letterbox import Letterbox
+from trilitenet.processing.nms import nms
+
+SIZE = (384, 640)
+CORE = ov.Core()
+
+
+def plain_onnx(network: TriLiteNet) -> bytes:
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(network, (torch.zeros(1, 3, *SIZE),), dynamo=True, opset_version=18, verbose=False)
+    assert program is not None
+    return program.model_proto.SerializeToString()
+
+
+def openvino_call(model: ov.Model, precision: str, threads: int | None, streams: int = 1) -> Callable[[], None]:
+    options: dict[str, object] = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": str(streams)}
+    options["PERFORMANCE_HINT"] = "LATENCY" if streams == 1 else "THROUGHPUT"
+    if threads:
+        options["INFERENCE_NUM_THREADS"] = threads
+    compiled = CORE.compile_model(model, "CPU", options)
+    source = compiled.inputs[0]
+    pixels = np.random.default_rng(0).integers(0, 256, tuple(source.shape))
+    value = pixels.astype(np.uint8 if source.element_type == ov.Type.u8 else np.float32)
+    requests = [compiled.create_infer_request() for _ in range(streams)]
+
+    def call() -> None:
+        for _ in range(1 if streams == 1 else 4):
+            for request in requests:
+                request.wait()
+                request.start_async([value], share_inputs=True)
+        for request in requests:
+            request.wait()
+
+    return call
+
+
+def onnxruntime_call(data: bytes, threads: int | None) -> Callable[[], None]:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    if threads:
+        options.intra_op_num_threads = threads
+    session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    source = session.get_inputs()[0]
+    value = np.random.default_rng(0).integers(0, 256, source.shape)
+    feed = {source.name: value.astype(np.uint8 if "uint8" in source.type else np.float32)}
+    return lambda: session.run(None, feed)
+
+
+def plain_frame(network: TriLiteNet, image: np.ndarray) -> None:
+    """Letterbox, eager network, interpolate, argmax, suppression: as published."""
+    letterbox = Letterbox.fit(image.shape[:2])
+    canvas = letterbox.image(image)
+    with torch.inference_mode():
+        outputs = network(normalise_images(torch.from_numpy(canvas).permute(2, 0, 1)[None].contiguous()))
+        rows = network.decode(outputs)[0]
+        for logits in (outputs.drivable, outputs.lane):
+            inside = logits[:, :, letterbox.inside[0], letterbox.inside[1]]
+            torch.nn.functional.interpolate(inside, size=image.shape[:2], mode="bilinear").argmax(1).numpy()
+        rows = rows[rows[:, 4] > 0.25].numpy()
+    xyxy = np.concatenate((rows[:, :2] - rows[:, 2:4] / 2, rows[:, :2] + rows[:, 2:4] / 2), 1)
+    nms(xyxy, rows[:, 4] * rows[:, 5], np.zeros(len(rows), np.int64), 0.6, 300)
+
+
+def few_boxes(network: TriLiteNet) -> TriLiteNet:
+    """Lower the objectness of random weights, so that a frame has few boxes, as a trained network's has."""
+    with torch.no_grad():
+        for conv in network.detection.convs:
+            conv.bias.view(3, -1)[:, 4] -= 8
+    return network
+
+
+def measure(variant: str, arguments: argparse.Namespace, folder: Path) -> dict[str, dict[str, float]]:
+    torch.manual_seed(0)
+    network = few_boxes(build_network(variant).eval())
+    plain = plain_onnx(network)
+    plain_model = CORE.read_model(plain, b"")
+    auto = pick_layout(arguments.layout, variant, "openvino", amx=has_amx())
+    info = ArtefactInfo("openvino", "bf16", SIZE)
+    proto = build_onnx(DeployGraph(network, auto), network.card, info)
+    deploy = build_openvino(proto)
+    threads = arguments.threads
+    image = np.random.default_rng(0).integers(0, 256, (720, 1280, 3), np.uint8)
+    image = cv2.blur(image, (9, 9))
+
+    calls: dict[str, Callable[[], object]] = {
+        "plain openvino bf16": openvino_call(plain_model, "bf16", threads),
+        "deploy openvino bf16": openvino_call(deploy, "bf16", threads),
+        "plain openvino fp32": openvino_call(plain_model, "f32", threads),
+        "deploy openvino fp32": openvino_call(deploy, "f32", threads),
+    }
+    if arguments.int8:
+        frames = list(np.random.default_rng(0).integers(0, 256, (8, 1, *SIZE, 3), np.uint8))
+        quantised = quantize_openvino(deploy, frames, KEEP_STEPS[1])
+        calls["deploy openvino int8 + bf16"] = openvino_call(quantised, "bf16", threads)
+    if arguments.eager:
+        zeros = torch.zeros(1, 3, *SIZE)
+
+        def eager() -> None:
+            with torch.inference_mode():
+                network(zeros)
+
+        calls["plain eager fp32"] = eager
+    if arguments.onnxruntime:
+        layout = pick_layout("auto", variant, "onnxruntime", amx=has_amx())
+        calls["plain onnxruntime fp32"] = onnxruntime_call(plain, threads)
+        data = build_onnx(DeployGraph(network, layout), network.card, info).SerializeToString()
+        calls["deploy onnxruntime fp32"] = onnxruntime_call(data, threads)
+    if arguments.streams:
+        calls["plain openvino bf16, 8 frames on 2 streams"] = openvino_call(plain_model, "bf16", None, 2)
+        calls["deploy openvino bf16, 8 frames on 2 streams"] = openvino_call(deploy, "bf16", None, 2)
+    if arguments.frame:
+        big = DeployGraph(network, auto, mask_scale=2, thresholds=Thresholds())
+        path = folder / f"{variant}.xml"
+        doubled = ArtefactInfo("openvino", "bf16", SIZE, mask_scale=2)
+        save_openvino(build_openvino(build_onnx(big, network.card, doubled)), path, network.card, doubled)
+        predictor = Predictor(OpenVINOBackend(path, threads=threads))
+        calls["plain frame"] = lambda: plain_frame(network, image)
+        calls["deploy frame"] = lambda: predictor.perceive([image])
+
+    clock = time.process_time if arguments.cpu_time else time.perf_counter
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for call in calls.values():
+        call()
+        call()
+    for _ in range(arguments.rounds):
+        for name, call in calls.items():
+            started = clock()
+            call()
+            times[name].append(1e3 * (clock() - started))
+    return {
+        name: {
+            "p10": float(np.percentile(values, 10)),
+            "p50": float(np.median(values)),
+            "p99": float(np.percentile(values, 99)),
+            "ratio": ratio(times, name),
+        }
+        for name, values in times.items()
+    }
+
+
+def ratio(times: dict[str, list[float]], name: str) -> float:
+    """Return the median over the rounds of the plain counterpart's time over this one's."""
+    kind = "plain frame" if name.endswith("frame") else "plain openvino bf16"
+    if "onnxruntime" in name:
+        kind = "plain onnxruntime fp32"
+    elif "streams" in name:
+        kind = "plain openvino bf16, 8 frames on 2 streams"
+    return float(np.median(np.array(times[kind]) / np.array(times[name])))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--variant", nargs="+", default=["tiny", "small", "base"])
+    parser.add_argument("--rounds", type=int, default=30)
+    parser.add_argument("--threads", type=int)
+    parser.add_argument("--layout", default="auto", choices=["auto", *LAYOUTS])
+    parser.add_argument("--cpu-time", action="store_true", help="processor time instead of wall time")
+    for part in ("eager", "onnxruntime", "streams", "frame", "int8"):
+        parser.add_argument(f"--no-{part}", dest=part, action="store_false")
+    parser.add_argument("--output", type=Path)
+    arguments = parser.parse_args()
+    results = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for variant in arguments.variant:
+            results[variant] = measure(variant, arguments, Path(folder))
+            print(f"{variant}: milliseconds p10, p50, p99; plain / own")
+            for name, row in results[variant].items():
+                print(
+                    f"  {name:45s} {row['p10']:8.2f} {row['p50']:8.2f} {row['p99']:8.2f}  {row['ratio']:5.2f}",
+                    flush=True,
+                )
+    if arguments.output:
+        arguments.output.write_text(json.dumps(results, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,357 @@
+"""Measure speed: models and runtimes in turn, so that a busy machine slows all of them alike."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+import trilitenet
+from trilitenet.commands.load import load
+from trilitenet.config import VARIANTS
+from trilitenet.errors import ConfigError, OutputError, import_extra
+from trilitenet.inference.predictor import Predictor
+
+__all__ = ["Benchmark", "Cost", "Timing", "benchmark"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Timing:
+    """One model on one runtime at one batch size.
+
+    Attributes:
+        model: As it was named.
+        backend: The runtime, device and precision.
+        stage: ``"network"`` (letterboxed pixels to raw outputs) or ``"frame"`` (image to boxes and masks of its size).
+        batch: Images a call.
+        p50: Median milliseconds a call.
+        p90: 90th percentile.
+        p99: 99th percentile.
+        frames_per_second: Images a second at the median.
+        ratio: Median over the rounds of the first entry's time an image over this one's: above 1 is faster.
+        first_result: Seconds from loading the model to its first result.
+        joules: A frame, of the processor package or the GPU; None where it cannot be read.
+        watts: Mean over the measurement; None likewise.
+    """
+
+    model: str
+    backend: str
+    stage: str
+    batch: int
+    p50: float
+    p90: float
+    p99: float
+    frames_per_second: float
+    ratio: float
+    first_result: float
+    joules: float | None = None
+    watts: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Cost:
+    """What a variant costs (the counterpart of the paper's cost table).
+
+    Attributes:
+        variant: Its name.
+        parameters: Number of parameters.
+        multiply_adds: Of convolutions and matrix products for one image of ``size``.
+        size: (height, width) in pixels.
+    """
+
+    variant: str
+    parameters: int
+    multiply_adds: int
+    size: tuple[int, int]
+
+
+@dataclasses.dataclass(frozen=True)
+class Benchmark:
+    """The measurements, and what they were made on.
+
+    Attributes:
+        timings: A row an entry; the first is the baseline of the ratios.
+        costs: Of the variants, with ``--table cost``.
+        machine: Processor, threads, versions.
+        rounds: Timed calls an entry.
+        peak_memory: Bytes of the process at its largest, all entries together; None where unknown.
+    """
+
+    timings: tuple[Timing, ...]
+    costs: tuple[Cost, ...]
+    machine: dict[str, str]
+    rounds: int
+    peak_memory: int | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``json.dumps`` takes."""
+        return dataclasses.asdict(self)
+
+    def summary(self) -> str:
+        """Return the tables that the command line prints."""
+        lines = [", ".join(f"{key} {value}" for key, value in self.machine.items())]
+        if self.costs:
+            lines += ["", "| variant | parameters, M | multiply-adds, G | input |", "|---|---|---|---|"]
+            lines += [
+                f"| {cost.variant} | {cost.parameters / 1e6:.3f} | {cost.multiply_adds / 1e9:.3f} "
+                f"| {cost.size[1]}x{cost.size[0]} |"
+                for cost in self.costs
+            ]
+        if self.timings:
+            lines += [
+                "",
+                "| model | runtime | stage | batch | p50 ms | p90 | p99 | frames/s | ratio | first s | J/frame | W |",
+                "|---|---|---|---|---|---|---|---|---|---|---|---|",
+            ]
+            lines += [
+                f"| {row.model} | {row.backend} | {row.stage} | {row.batch} | {row.p50:.2f} | {row.p90:.2f} "
+                f"| {row.p99:.2f} | {row.frames_per_second:.1f} | {row.ratio:.2f} | {row.first_result:.2f} "
+                f"| {_or_dash(row.joules)} | {_or_dash(row.watts)} |"
+                for row in self.timings
+            ]
+            memory = "" if self.peak_memory is None else f", peak memory {self.peak_memory / 2**20:.0f} MiB in all"
+            lines.append(f"{self.rounds} interleaved rounds{memory}; ratio: to the first row, above 1 is faster")
+        return "\n".join(lines)
+
+
+def benchmark(
+    *models: str,
+    backend: Sequence[str] = ("auto",),
+    batch: Sequence[int] = (1,),
+    stage: Literal["network", "frame"] = "network",
+    table: Literal["latency", "cost"] = "latency",
+    rounds: int = 50,
+    warmup: int = 5,
+    size: tuple[int, int] = (384, 640),
+    source: tuple[int, int] = (720, 1280),
+    device: str = "auto",
+    streams: int = 1,
+    threads: int | None = None,
+    output: Path | None = None,
+    plot: Path | None = None,
+) -> Benchmark:
+    """Measure latency, its tail, frames a second, first-result time and energy of models and runtimes, in turn.
+
+    Args:
+        models: Names of shipped weights, weight files or exported artefacts; the first is the baseline.
+        backend: Runtimes to try each model on; those that do not run a file are an error.
+        batch: Images a call.
+        stage: network (letterboxed pixels to raw outputs) or frame (image to boxes and masks of its own size).
+        table: latency, or cost: parameters and multiply-adds of the three variants, nothing timed.
+        rounds: Timed calls an entry; every round calls each entry once.
+        warmup: Calls before.
+        size: Height and width of the network's input, where a model takes any.
+        source: Height and width of the image for --stage frame.
+        device: auto, cpu, cuda.
+        streams: Images OpenVINO computes at once; use with --batch of as many or more.
+        threads: Threads of ONNX Runtime or OpenVINO.
+        output: JSON file to write.
+        plot: Picture (.png, .svg) of the distributions to write.
+
+    Returns:
+        The measurements.
+
+    Raises:
+        ConfigError: If there is nothing to measure, or a number is not positive.
+        OutputError: If a file cannot be written.
+    """
+    if min(rounds, *batch) < 1 or warmup < 0:
+        raise ConfigError("--rounds and --batch must be at least 1, --warmup not negative")
+    machine = _machine(threads, streams)
+    if table == "cost":
+        result = Benchmark((), _costs(size), machine, 0, None)
+    else:
+        names = models or ("tiny",)
+        entries = [_Entry(name, one, device, streams, threads) for name in names for one in backend]
+        calls = [_Call(entry, count, stage, size, source) for entry in entries for count in batch]
+        result = Benchmark(_measure(calls, rounds, warmup), (), machine, rounds, _peak_memory())
+        if plot is not None:
+            _plot(calls, plot)
+        for entry in entries:
+            entry.predictor.close()
+    if output is not None:
+        try:
+            output.parent.mkdir(parents=True, exist_ok=True)
+            output.write_text(json.dumps(result.to_dict(), indent=2) + "\n", encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"{output}: cannot be written ({error})") from error
+    return result
+
+
+class _Entry:
+    """A model on a runtime, and when it was loaded."""
+
+    def __init__(self, model: str, backend: str, device: str, streams: int, threads: int | None) -> None:
+        self.model = model
+        self.started = time.perf_counter()
+        self.predictor: Predictor = load(model, backend=backend, device=device, streams=streams, threads=threads)
+        self.first: float | None = None
+
+
+class _Call:
+    """What is timed."""
+
+    def __init__(self, entry: _Entry, batch: int, stage: str, size: tuple[int, int], source: tuple[int, int]) -> None:
+        self.entry, self.batch, self.stage = entry, batch, stage
+        generator = np.random.default_rng(0)
+        self.milliseconds: list[float] = []
+        self.joules: list[float] = []
+        predictor = entry.predictor
+        if stage == "network":
+            height, width = predictor.backend.canvas or size
+            images = generator.integers(0, 256, (batch, height, width, 3), np.uint8)
+            self.run: Callable[[], object] = lambda: predictor.backend.run(images)
+        else:
+            frames: list[NDArray[np.uint8]] = [generator.integers(0, 256, (*source, 3), np.uint8)] * batch
+            self.run = lambda: predictor.perceive(frames)
+
+    def once(self) -> None:
+        """Run once and note when the model gave its first result."""
+        self.run()
+        if self.entry.first is None:
+            self.entry.first = time.perf_counter() - self.entry.started
+
+
+def _measure(calls: Sequence[_Call], rounds: int, warmup: int) -> tuple[Timing, ...]:
+    meter = _Meter()
+    for call in calls:
+        call.once()
+    for _ in range(warmup):
+        for call in calls:
+            call.run()
+    for _ in range(rounds):
+        for call in calls:
+            before = meter.read()
+            started = time.perf_counter()
+            call.run()
+            call.milliseconds.append(1e3 * (time.perf_counter() - started))
+            after = meter.read()
+            if before is not None and after is not None and after >= before:
+                call.joules.append(after - before)
+    first = np.array(calls[0].milliseconds) / calls[0].batch
+    timings = []
+    for call in calls:
+        times = np.array(call.milliseconds)
+        p50, p90, p99 = (float(np.percentile(times, percent)) for percent in (50, 90, 99))
+        energy = statistics.fmean(call.joules) if len(call.joules) == rounds else None
+        timings.append(
+            Timing(
+                model=Path(call.entry.model).name,
+                backend=call.entry.predictor.backend.name,
+                stage=call.stage,
+                batch=call.batch,
+                p50=p50,
+                p90=p90,
+                p99=p99,
+                frames_per_second=1e3 * call.batch / p50,
+                ratio=float(np.median(first / (times / call.batch))),
+                first_result=call.entry.first or 0.0,
+                joules=None if energy is None else energy / call.batch,
+                watts=None if energy is None else 1e3 * energy / statistics.fmean(call.milliseconds),
+            )
+        )
+    return tuple(timings)
+
+
+class _Meter:
+    """Energy in joules since some time: the processor package by RAPL, or the GPU by NVML; whatever can be read."""
+
+    def __init__(self) -> None:
+        self._read: Callable[[], float] | None = None
+        for rapl in sorted(Path("/sys/class/powercap").glob("*-rapl:0/energy_uj")):
+            if os.access(rapl, os.R_OK):
+                self._read = lambda rapl=rapl: int(rapl.read_text(encoding="ascii")) / 1e6  # type: ignore[misc]
+        try:
+            import pynvml
+
+            pynvml.nvmlInit()
+            gpu = pynvml.nvmlDeviceGetHandleByIndex(0)
+            self._read = lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3
+        except (ImportError, OSError, RuntimeError):
+            pass
+        except Exception as error:  # NVML's own errors derive from Exception alone
+            if type(error).__module__ != "pynvml":
+                raise
+
+    def read(self) -> float | None:
+        """Return joules, or None where nothing can be read."""
+        return None if self._read is None else self._read()
+
+
+def _machine(threads: int | None, streams: int) -> dict[str, str]:
+    processor = platform.processor() or platform.machine()
+    flags = ""
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                processor = line.partition(":")[2].strip()
+            if line.startswith("flags"):
+                known = ("avx2", "avx512f", "avx512_bf16", "avx512_vnni", "amx_bf16", "amx_int8")
+                flags = " ".join(flag for flag in known if flag in line.split())
+                break
+    except OSError:
+        pass
+    return {
+        "processor": f"{processor} ({flags})" if flags else processor,
+        "cores": str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()),
+        "threads": "the runtime's choice" if threads is None else str(threads),
+        "streams": str(streams),
+        "system": platform.platform(terse=True),
+        "trilitenet": trilitenet.__version__,
+    }
+
+
+def _costs(size: tuple[int, int]) -> tuple[Cost, ...]:
+    from trilitenet.models.cost import count_multiply_adds, count_parameters
+    from trilitenet.models.trilitenet import build_network
+
+    networks = {name: build_network(name) for name in VARIANTS}
+    return tuple(
+        Cost(name, count_parameters(network), count_multiply_adds(network, size), size)
+        for name, network in networks.items()
+    )
+
+
+def _peak_memory() -> int | None:
+    """Return the largest resident size of the process in bytes."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def _plot(calls: Sequence[_Call], path: Path) -> None:
+    import_extra("matplotlib", "evaluate")
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 1 + 0.6 * len(calls)), layout="constrained")
+    axes = figure.subplots()
+    axes.boxplot([call.milliseconds for call in calls], orientation="horizontal", whis=(1, 99), showfliers=False)
+    axes.set_yticks(
+        range(1, len(calls) + 1),
+        [f"{Path(call.entry.model).name}\n{call.entry.predictor.backend.name}, batch {call.batch}" for call in calls],
+    )
+    axes.invert_yaxis()
+    axes.set_xlabel("milliseconds a call (box: quartiles, whiskers: 1st and 99th percentile)")
+    axes.set_xlim(left=0)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path)
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{path}: cannot be written ({error})") from error
+
+
+def _or_dash(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

@@ -1,0 +1,419 @@
+"""Export a model to another runtime, checked against the network before anything is written."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+import trilitenet
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, MAX_STRIDE, ArtefactInfo
+from trilitenet.data.reading import DrivingDataset
+from trilitenet.deploy.graph import DeployGraph, Masks
+from trilitenet.deploy.layouts import pick_layout
+from trilitenet.deploy.onnx import build_onnx, save_onnx
+from trilitenet.deploy.openvino import build_openvino, has_amx, save_openvino
+from trilitenet.deploy.parity import TOLERANCES, Parity, compare
+from trilitenet.deploy.quantize import KEEP_STEPS, quantize_onnx, quantize_openvino
+from trilitenet.deploy.tensorrt import build_engine, is_installed, trtexec_line
+from trilitenet.deploy.triton import write_triton_repository
+from trilitenet.engine.evaluate import evaluate
+from trilitenet.errors import BackendError, ConfigError, InputError, OutputError
+from trilitenet.inference.backend import Backend
+from trilitenet.inference.predictor import Predictor
+from trilitenet.inference.torch_backend import TorchBackend
+from trilitenet.models.trilitenet import TriLiteNet
+from trilitenet.models.weights import load_network
+from trilitenet.processing.images import read_image
+from trilitenet.processing.letterbox import Letterbox
+from trilitenet.structures import RawOutputs
+
+__all__ = ["Exported", "export"]
+
+Format = Literal["onnx", "openvino", "tensorrt", "torch", "triton"]
+Precision = Literal["fp32", "fp16", "bf16", "int8"]
+
+_SUFFIXES = {"onnx": ".onnx", "openvino": ".xml", "tensorrt": ".engine", "torch": ".pt2"}
+_PRECISIONS = {
+    "onnx": ("fp32", "fp16", "int8"),
+    "openvino": ("fp32", "fp16", "bf16", "int8"),
+    "tensorrt": ("fp32", "fp16", "bf16", "int8"),
+    "torch": ("fp32",),
+    "triton": ("fp32", "fp16", "int8"),
+}
+_IMAGES = {".bmp", ".jpeg", ".jpg", ".png", ".webp"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Exported:
+    """What an export wrote.
+
+    Attributes:
+        path: The artefact.
+        info: How it takes pixels and returns results.
+        parity: How it compares with the network; None if it cannot run here.
+        notes: What a user should know, such as the command that finishes the job elsewhere.
+    """
+
+    path: Path
+    info: ArtefactInfo
+    parity: Parity | None
+    notes: tuple[str, ...] = ()
+
+    def summary(self) -> str:
+        """Return the lines that the command line prints."""
+        size = "any multiple of 32" if self.info.size is None else f"{self.info.size[1]}x{self.info.size[0]}"
+        lines = [f"{self.path}: {self.info.format} {self.info.precision}, input {size} {self.info.colour.upper()}"]
+        if self.parity is not None:
+            lines.append(self.parity.summary())
+        return "\n".join((*lines, *self.notes))
+
+
+def export(
+    model: str = "tiny",
+    /,
+    *,
+    format: Format = "onnx",
+    output: Path | None = None,
+    precision: Precision = "fp32",
+    size: str = "384x640",
+    calibration: Path | None = None,
+    calibration_frames: int = 500,
+    max_drop: float | None = None,
+    nms: bool = False,
+    portable: bool = False,
+    masks: Masks = "decision",
+    mask_scale: int = 1,
+    bgr: bool = False,
+    layout: str = "auto",
+    frames: Path | None = None,
+    overwrite: bool = False,
+) -> Exported:
+    """Export a model to another runtime; preprocessing, anchors, classes and thresholds travel inside.
+
+    The artefact is compared with the float32 network on frames before it is kept: beyond the tolerance nothing is
+    written. Load it with `trilitenet.load`, which needs nothing else.
+
+    Args:
+        model: Name of shipped weights, or a file of weights.
+        format: onnx, openvino (.xml and .bin), tensorrt (.engine, or .onnx and the trtexec line), torch (.pt2) or
+            triton (a model repository with an ONNX graph in it).
+        output: File to write (for triton, the folder of the repository); by default named after the model, here.
+        precision: fp32, fp16 (weights stored so), bf16 (OpenVINO) or int8 (needs --calibration).
+        size: HEIGHTxWIDTH of the input in multiples of 32, or dynamic.
+        calibration: Frames for INT8: a data set in the published layout (its train split) or a folder of pictures.
+        calibration_frames: At most so many of them.
+        max_drop: INT8 may lose at most so many points of a score on the val split of --calibration; layers fall back
+            to floating point, part by part, until it does.
+        nms: Put non-maximum suppression inside, with the model's thresholds (onnx, openvino).
+        portable: Avoid operators that compilers for phones and accelerators refuse; float input, float mask logits.
+        masks: decision (0 or 1, by the model's thresholds), probability (x 255) or logit.
+        mask_scale: 2 doubles the size of masks inside the graph.
+        bgr: Take BGR pixels (`trilitenet.load` converts by itself).
+        layout: auto, or a memory layout by name (docs/speed.md); all compute the same.
+        frames: Pictures for the comparison; by default those of --calibration, else synthetic scenes.
+        overwrite: Replace an existing artefact.
+
+    Returns:
+        What was written.
+
+    Raises:
+        ConfigError: If options do not fit each other.
+        OutputError: If the artefact exists, or cannot be written.
+        BackendError: If the comparison fails.
+    """
+    if precision not in _PRECISIONS[format]:
+        raise ConfigError(f"{format} artefacts come as {', '.join(_PRECISIONS[format])}, not {precision}")
+    if nms and format not in ("onnx", "openvino", "triton"):
+        raise ConfigError("--nms is for onnx, openvino and triton")
+    if precision == "int8" and calibration is None:
+        raise ConfigError("int8 needs --calibration: a data set in the published layout, or a folder of road frames")
+    if max_drop is not None and precision != "int8":
+        raise ConfigError("--max-drop is for --precision int8")
+    if format == "tensorrt":
+        portable = True
+    parsed = _parse_size(size)
+    if precision == "int8" and parsed is None:
+        raise ConfigError("int8 needs a fixed --size")
+    if portable:
+        masks = "logit"
+    network = load_network(model).eval()
+    if format == "triton":
+        with tempfile.TemporaryDirectory() as folder:
+            exported = export(
+                model,
+                format="onnx",
+                output=Path(folder) / "model.onnx",
+                precision=precision,
+                size=size,
+                calibration=calibration,
+                calibration_frames=calibration_frames,
+                max_drop=max_drop,
+                nms=nms,
+                portable=portable,
+                masks=masks,
+                mask_scale=mask_scale,
+                bgr=bgr,
+                layout=layout,
+                frames=frames,
+            )
+            repository = output or Path("model_repository")
+            path = write_triton_repository(
+                exported.path, repository, network.card, name=Path(model).stem, overwrite=overwrite
+            )
+        serve = f"Serve it with: tritonserver --model-repository {repository.resolve()}"
+        return dataclasses.replace(exported, path=path, notes=(*exported.notes, serve))
+    path = output or Path(f"{Path(model).stem}{_SUFFIXES[format]}")
+    if path.suffix != _SUFFIXES[format] and format != "tensorrt":
+        raise ConfigError(f"{format} artefacts end with {_SUFFIXES[format]}, not {path.suffix or 'nothing'}")
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists already; give another --output or --overwrite")
+
+    info = ArtefactInfo(
+        format=format,
+        precision=precision,
+        size=parsed,
+        input="float_nchw" if portable else "uint8_nhwc",
+        colour="bgr" if bgr else "rgb",
+        masks=masks,
+        mask_scale=mask_scale,
+        nms=nms,
+        trilitenet=trilitenet.__version__,
+    )
+    runtime = "planar" if portable else {"onnx": "onnxruntime"}.get(format, format)
+    graph = DeployGraph(
+        network,
+        pick_layout(layout, network.variant, runtime, amx=has_amx()),
+        masks=masks,
+        mask_scale=mask_scale,
+        bgr=bgr,
+    )
+    canvas = parsed or network.card.input_size
+    if format == "torch":
+        return _export_torch(network, graph, info, path, _canvases(frames, canvas, 8))
+    thresholds = network.card.thresholds if nms else None
+    proto = build_onnx(graph, network.card, info, nms=thresholds, half=format == "onnx" and precision == "fp16")
+    if format == "tensorrt":
+        return _export_tensorrt(network, proto, info, path, _canvases(frames, canvas, 8))
+
+    built: Any = build_openvino(proto) if format == "openvino" else proto
+    checks = _canvases(frames or calibration, canvas, 8)
+    if precision != "int8":
+        return _keep(network, built, info, path, checks)
+    assert calibration is not None
+    inputs = [_as_input(image, info) for image in _canvases(calibration, canvas, calibration_frames, split="train")]
+    quantize = quantize_openvino if format == "openvino" else quantize_onnx
+    reason = ""
+    for keep in KEEP_STEPS if max_drop is not None else KEEP_STEPS[1:2]:
+        candidate = quantize(built, inputs, keep)
+        with tempfile.TemporaryDirectory() as folder:
+            trial = Path(folder) / path.name
+            _write(candidate, trial, network, info)
+            drop = 0.0 if max_drop is None else _measure_drop(network, trial, calibration)
+        if max_drop is None or drop <= max_drop:
+            exported = _keep(network, candidate, info, path, checks)
+            kept = f"in floating point: {', '.join(keep) or 'attention and depthwise convolutions only'}"
+            notes = (kept,) if max_drop is None else (kept, f"largest drop on val: {drop:.2f} points")
+            return dataclasses.replace(exported, notes=notes)
+        reason = f"{drop:.2f} points lost, at most {max_drop} allowed"
+    raise BackendError(f"{path}: not written, INT8 costs too much even with most layers in floating point ({reason})")
+
+
+def _parse_size(size: str) -> tuple[int, int] | None:
+    """Return (height, width), None for dynamic."""
+    if size == "dynamic":
+        return None
+    match = re.fullmatch(r"(\d+)x(\d+)", size)
+    if match is None:
+        raise ConfigError(f"--size is HEIGHTxWIDTH such as 384x640, or dynamic, not {size!r}")
+    height, width = int(match[1]), int(match[2])
+    if not height or not width or height % MAX_STRIDE or width % MAX_STRIDE:
+        raise ConfigError(f"--size must be multiples of {MAX_STRIDE}, got {height}x{width}")
+    return height, width
+
+
+def _canvases(source: Path | None, canvas: tuple[int, int], count: int, split: str = "val") -> list[NDArray[np.uint8]]:
+    """Return letterboxed frames, spread evenly over what there is; synthetic scenes without a source."""
+    if source is None:
+        from trilitenet.data.synthetic import SyntheticScenes
+
+        scenes = SyntheticScenes(seed=0, size=canvas)
+        images = [scenes[index].image for index in range(min(count, 4))]
+    else:
+        folder = source / "images" / split if (source / "images" / split).is_dir() else source
+        names = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _IMAGES)
+        if not names:
+            raise InputError(f"{source}: no pictures there")
+        chosen = np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int)
+        images = [read_image(names[index]) for index in chosen]
+    return [Letterbox.fit(image.shape[:2], canvas=canvas).image(image) for image in images]
+
+
+def _as_input(canvas: NDArray[np.uint8], info: ArtefactInfo) -> NDArray[Any]:
+    image = canvas[:, :, ::-1] if info.colour == "bgr" else canvas
+    if info.input == "float_nchw":
+        return np.ascontiguousarray(image.transpose(2, 0, 1)[None], np.float32)
+    return np.ascontiguousarray(image[None])
+
+
+def _write(built: Any, path: Path, network: TriLiteNet, info: ArtefactInfo) -> None:
+    if info.format == "openvino":
+        save_openvino(built, path, network.card, info)
+    else:
+        save_onnx(built, path)
+
+
+def _keep(
+    network: TriLiteNet, built: Any, info: ArtefactInfo, path: Path, checks: Sequence[NDArray[np.uint8]]
+) -> Exported:
+    """Write beside the destination, compare, and only then move into place."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
+        trial = Path(folder) / path.name
+        _write(built, trial, network, info)
+        parity = _compare(network, _open(trial, info), info, checks)
+        _require(parity, path)
+        for part in Path(folder).iterdir():
+            part.replace(path.parent / part.name)
+    return Exported(path, info, parity)
+
+
+def _open(path: Path, info: ArtefactInfo) -> Backend:
+    if info.format == "openvino":
+        from trilitenet.inference.openvino_backend import OpenVINOBackend
+
+        return OpenVINOBackend(path)
+    from trilitenet.inference.onnx_backend import OnnxBackend
+
+    return OnnxBackend(path, "cpu")
+
+
+def _compare(network: TriLiteNet, backend: Backend, info: ArtefactInfo, checks: Sequence[NDArray[np.uint8]]) -> Parity:
+    thresholds = network.card.thresholds
+    reference: Backend = TorchBackend(network, "cpu")
+    if info.nms:
+        reference = _Suppressed(reference)
+    return compare(
+        reference.run,
+        backend.run,
+        checks,
+        TOLERANCES[info.precision],
+        masks=(thresholds.drivable, thresholds.lane),
+        confidence=thresholds.confidence,
+    )
+
+
+class _Suppressed:
+    """The network with suppression after it, to compare with an artefact that has it inside."""
+
+    def __init__(self, backend: Backend) -> None:
+        self._backend = backend
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._backend, name)
+
+    def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
+        from trilitenet.processing.boxes import cxcywh_to_xyxy
+        from trilitenet.processing.nms import nms
+
+        raw = self._backend.run(batch)
+        if raw.detection is None:
+            return raw
+        thresholds = self._backend.card.thresholds
+        rows = raw.detection[0]
+        class_id = rows[:, 5:].argmax(1)
+        scores = rows[:, 4] * rows[:, 5:].max(1)
+        above = scores > thresholds.confidence
+        rows, class_id, scores = rows[above], class_id[above], scores[above]
+        kept = nms(cxcywh_to_xyxy(rows[:, :4]), scores, class_id, thresholds.iou, thresholds.max_boxes)
+        return dataclasses.replace(raw, detection=rows[kept][None])
+
+
+def _require(parity: Parity, path: Path) -> None:
+    if parity.failures:
+        raise BackendError(f"{path}: not written, it differs from the network: {'; '.join(parity.failures)}")
+
+
+def _measure_drop(network: TriLiteNet, artefact: Path, data: Path, limit: int = 150) -> float:
+    """Return the largest loss of a score in points on the val split, against the float32 network."""
+    from trilitenet.commands.load import load
+
+    if not (data / "images" / "val").is_dir():
+        raise ConfigError(f"--max-drop needs labels; {data} is not a data set with a val split")
+    dataset = DrivingDataset(data, "val", class_names=network.card.class_names)
+
+    def scores(predictor: Predictor) -> dict[str, float]:
+        report = evaluate(predictor, dataset, limit=limit, resamples=0, worst=0, by=())
+        main = ("fair/detection/map50", "fair/drivable/miou", "fair/lane/iou")
+        return {key: figure.value for key, figure in report.figures.items() if key in main}
+
+    before = scores(Predictor(TorchBackend(network, "cpu")))
+    with load(artefact) as predictor:
+        after = scores(predictor)
+    return max((100 * (value - after[key]) for key, value in before.items()), default=0.0)
+
+
+def _export_torch(
+    network: TriLiteNet, graph: DeployGraph, info: ArtefactInfo, path: Path, checks: Sequence[NDArray[np.uint8]]
+) -> Exported:
+    from trilitenet.inference.exported_torch_backend import ExportedTorchBackend
+
+    class Outputs(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.network = graph
+
+        def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
+            return tuple(output for output in self.network(image) if output is not None)
+
+    height, width = info.size or network.card.input_size
+    image = torch.from_numpy(_as_input(np.zeros((height, width, 3), np.uint8), info))
+    dynamic = None
+    if info.size is None:
+        rows, columns = (MAX_STRIDE * torch.export.Dim(name, min=2, max=128) for name in ("rows", "columns"))
+        axis = 2 if info.input == "float_nchw" else 1
+        dynamic = ({axis: rows, axis + 1: columns},)
+    with torch.no_grad():
+        program = torch.export.export(Outputs().eval(), (image,), dynamic_shapes=dynamic)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
+        trial = Path(folder) / path.name
+        metadata = {CARD_KEY: network.card.to_json(), ARTEFACT_KEY: info.to_json()}
+        torch.export.save(program, trial, extra_files=metadata)
+        parity = _compare(network, ExportedTorchBackend(trial, "cpu"), info, checks)
+        _require(parity, path)
+        os.replace(trial, path)  # noqa: PTH105
+    return Exported(path, info, parity)
+
+
+def _export_tensorrt(
+    network: TriLiteNet, proto: Any, info: ArtefactInfo, path: Path, checks: Sequence[NDArray[np.uint8]]
+) -> Exported:
+    """Build an engine where TensorRT is; else write the restricted ONNX graph and say how to build it."""
+    if is_installed():  # pragma: no cover - needs a GPU and TensorRT
+        from trilitenet.inference.tensorrt_backend import TensorRTBackend, pack_engine
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+            trial = Path(folder) / path.name
+            trial.write_bytes(pack_engine(build_engine(proto, info.precision), network.card, info))
+            parity = _compare(network, TensorRTBackend(trial), info, checks)
+            _require(parity, path)
+            os.replace(trial, path)  # noqa: PTH105
+        return Exported(path, info, parity)
+    onnx_path = path.with_suffix(".onnx")
+    exported = _keep(network, proto, dataclasses.replace(info, format="onnx", precision="fp32"), onnx_path, checks)
+    notes = (
+        "TensorRT is not installed here: no engine was built, and none was run.",
+        "On the machine that will run it:",
+        f"  {trtexec_line(onnx_path, path.with_suffix('.plan'), info.precision)}",
+    )
+    return dataclasses.replace(exported, notes=notes)

@@ -1,0 +1,148 @@
+"""The deploy graph equals the network: relative error below 1e-5, more than 0.99999 of mask pixels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.deploy.networks import lively_network
+from trilitenet.config import STRIDES, Thresholds
+from trilitenet.deploy.graph import DeployGraph
+from trilitenet.deploy.layouts import LAYOUTS
+from trilitenet.errors import ConfigError, ShapeError
+from trilitenet.models.trilitenet import TriLiteNet, normalise_images
+
+
+def by_cell(detection: Tensor, height: int, width: int) -> Tensor:
+    """Bring the network's order (anchor, row, column) into the graph's (row, column, anchor)."""
+    parts, start = [], 0
+    for stride in STRIDES:
+        cells = height // stride * (width // stride)
+        level = detection[:, start : start + 3 * cells].view(len(detection), 3, cells, -1)
+        parts.append(level.transpose(1, 2).flatten(1, 2))
+        start += 3 * cells
+    return torch.cat(parts, 1)
+
+
+def relative_error(value: Tensor, wanted: Tensor) -> float:
+    return float((value - wanted).norm() / wanted.norm())
+
+
+def check(network: TriLiteNet, size: tuple[int, int] = (64, 128), batch: int = 1, **options: Any) -> None:
+    images = torch.randint(0, 256, (batch, *size, 3), dtype=torch.uint8)
+    with torch.inference_mode():
+        outputs = network(normalise_images(images.permute(0, 3, 1, 2), network.card.mean, network.card.std))
+        logits = DeployGraph(network, masks="logit", **options)(images)
+        decided = DeployGraph(network, **options)(images)
+        if outputs.detection is None:
+            assert decided.detection is None
+        else:
+            assert relative_error(decided.detection, by_cell(network.decode(outputs), *size)) < 1e-5
+        for name in ("drivable", "lane"):
+            wanted = getattr(outputs, name)
+            if wanted is None:
+                assert getattr(decided, name) is None
+                continue
+            difference = wanted[:, 1] - wanted[:, 0]
+            assert relative_error(getattr(logits, name), difference) < 1e-5
+            mask = getattr(decided, name)
+            assert mask.dtype == torch.uint8
+            assert mask.shape == difference.shape
+            assert ((mask == 1) == (difference > 0)).float().mean() > 0.99999
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("variant", ["tiny", "small", "base"])
+def test_variants_and_layouts(variant: str, layout: str) -> None:
+    check(lively_network(variant), layout=LAYOUTS[layout])
+
+
+@pytest.mark.parametrize("size", [(384, 640), (256, 448), (640, 640)])
+@pytest.mark.parametrize("layout", ["wide", "pixels", "planar-maximum"])
+def test_sizes(size: tuple[int, int], layout: str) -> None:
+    check(lively_network(), size, layout=LAYOUTS[layout])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["small", "base"])
+@pytest.mark.parametrize("size", [(384, 640), (256, 448), (640, 640)])
+def test_sizes_of_larger_variants(variant: str, size: tuple[int, int]) -> None:
+    check(lively_network(variant), size)
+
+
+@pytest.mark.parametrize(
+    "tasks",
+    [("detection",), ("drivable",), ("lane",), ("detection", "lane"), ("drivable", "lane"), ("detection", "drivable")],
+)
+def test_task_subsets(tasks: tuple[str, ...]) -> None:
+    check(lively_network(tasks=tasks))
+
+
+@pytest.mark.parametrize("classes", [1, 10])
+def test_classes(classes: int) -> None:
+    check(lively_network(classes=classes))
+
+
+@pytest.mark.parametrize("part", ["pcaa", "litepan", "spp"])
+def test_ablated_networks(part: str) -> None:
+    check(lively_network(**{part: False}))
+
+
+def test_batches() -> None:
+    check(lively_network(), batch=3)
+
+
+def test_anchors_are_those_of_the_network() -> None:
+    anchors = tuple(tuple((3.0 + i + j, 5.0 + 2 * i + j) for j in range(3)) for i in range(3))
+    check(lively_network(anchors=anchors))
+
+
+@pytest.mark.parametrize("layout", ["heads", "planar"])
+def test_bgr_and_doubled_masks(layout: str) -> None:
+    network = lively_network()
+    images = torch.randint(0, 256, (1, 64, 128, 3), dtype=torch.uint8)
+    with torch.inference_mode():
+        logits = DeployGraph(network, LAYOUTS[layout], masks="logit")(images).lane
+        doubled = DeployGraph(network, LAYOUTS[layout], bgr=True, mask_scale=2)(images.flip(3)).lane
+    assert logits is not None
+    assert doubled is not None
+    wanted = torch.nn.functional.interpolate(logits[None], scale_factor=2, mode="bilinear")[0]
+    assert doubled.shape == (1, 128, 256)
+    assert ((doubled == 1) == (wanted > 0)).float().mean() > 0.9999
+
+
+def test_thresholds_and_probabilities() -> None:
+    network = lively_network()
+    images = torch.randint(0, 256, (1, 64, 128, 3), dtype=torch.uint8)
+    with torch.inference_mode():
+        probability = DeployGraph(network, masks="probability")(images).lane
+        strict = DeployGraph(network, thresholds=Thresholds(lane=0.51))(images).lane
+        outputs = network(normalise_images(images.permute(0, 3, 1, 2)))
+    assert probability is not None
+    assert strict is not None
+    wanted = outputs.lane.softmax(1)[:, 1]
+    assert (probability.float() - wanted * 255).abs().max() <= 0.51
+    assert ((strict == 1) == (wanted > 0.51)).float().mean() > 0.9999
+
+
+def test_portable_input() -> None:
+    network = lively_network()
+    images = torch.randint(0, 256, (1, 64, 128, 3), dtype=torch.uint8)
+    graph = DeployGraph(network, LAYOUTS["planar"])
+    with torch.inference_mode():
+        pixels, planes = graph(images), graph(images.permute(0, 3, 1, 2).float())
+    assert torch.equal(pixels.detection, planes.detection)
+    assert torch.equal(pixels.lane, planes.lane)
+
+
+def test_wrong_options_and_shapes() -> None:
+    network = lively_network(tasks=("lane",))
+    with pytest.raises(ConfigError, match="mask_scale"):
+        DeployGraph(network, masks="probability", mask_scale=2)
+    with pytest.raises(ConfigError, match="unknown masks"):
+        DeployGraph(network, masks="soft")  # type: ignore[arg-type]
+    with pytest.raises(ShapeError, match="uint8"):
+        DeployGraph(network)(torch.zeros(1, 3, 64, 64))
