@@ -54,9 +54,12 @@ def rays(camera: Camera) -> tuple[Plane, Plane, Plane]:
     """Return each pixel's direction as three (H, W) planes: forward, left, up."""
     height, width = camera.size
     columns = camera.rotation @ np.linalg.inv(camera.matrix)
-    u, v = np.arange(width, dtype=np.float64)[None], np.arange(height, dtype=np.float64)[:, None]
-    forward, left, up = (columns[i, 0] * u + columns[i, 1] * v + columns[i, 2] for i in range(3))
-    return forward.astype(np.float32), left.astype(np.float32), up.astype(np.float32)
+    u, v = np.arange(width)[None], np.arange(height)[:, None]
+    forward, left, up = (
+        (columns[i, 0] * u + columns[i, 2]).astype(np.float32) + (columns[i, 1] * v).astype(np.float32)
+        for i in range(3)
+    )
+    return forward, left, up
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.data.synthetic_ground import draw_ground
-from trilitenet.data.synthetic_optics import Lighting, look_up, noise, rays
+from trilitenet.data.synthetic_optics import Lighting, Plane, look_up, noise, rays
 from trilitenet.data.synthetic_scenery import draw_barrier, draw_item
 from trilitenet.data.synthetic_vehicles import Lamp, VehiclePose, draw_shadow, draw_vehicle
 from trilitenet.data.synthetic_weather import add_camera_faults, draw_bonnet, draw_glare, draw_rain, draw_reflections
@@ -86,19 +86,37 @@ def render(
 
 
 def _draw_sky(world: World) -> NDArray[np.uint8]:
-    light, camera = world.light, world.camera
+    """Return the picture with sky and skyline, and with the farthest ground below."""
+    camera = world.camera
     height, width = camera.size
     forward, left, up = rays(camera)
-    limit = int(np.clip(np.nanmax(camera.horizon([0, width - 1])) + 3, 1, height))
-    f, side, u = forward[:limit], left[:limit], up[:limit]
-    elevation = np.maximum(u / f, 0.0)
+    limit = int(np.clip(camera.horizon([0, width - 1]).max() + 3, 2, height))
+    lighting = Lighting(world)
+    image = np.empty((height, width, 3), np.uint8)
+    image[:] = np.clip(lighting.tone(world.layout.terrain, FAR, 50.0), 0, 255)
+    # The air varies slowly: every second row and column is enough.
+    air = _draw_air(world, *(plane[:limit:2, ::2] for plane in (forward, left, up)))
+    image[:limit] = cv2.resize(air, (width, limit), interpolation=cv2.INTER_LINEAR)
+    slope = up[:limit] / forward[:limit]
+    reached = np.flatnonzero(slope.min(axis=1) < 1.7 * max(world.skyline))
+    if len(reached):
+        top = int(reached[0])
+        azimuth = np.arctan2(left[limit - 1], forward[limit - 1]) + world.bearing + world.texture % 100
+        _draw_skyline(world, image[top:limit], slope[top:], azimuth.astype(np.float32), lighting)
+    return image
+
+
+def _draw_air(world: World, forward: Plane, left: Plane, up: Plane) -> NDArray[np.uint8]:
+    """Return sky, clouds and the glow around the sun, for pixels that look in these directions."""
+    light = world.light
+    aside, elevation = left / forward, np.maximum(up / forward, 0.0)
     share = np.minimum(1.0, elevation * 2.4) ** 0.7
     planes = [np.float32(h) + share * np.float32(z - h) for z, h in zip(light.zenith, light.horizon, strict=True)]
     if light.clouds > 0 and light.time != "night":
         depth = 60.0 / (elevation + 0.06)
         cos, sin = math.cos(world.bearing), math.sin(world.bearing)
-        cx = depth * (cos - sin * side / f) + world.texture % 997
-        cy = depth * (sin + cos * side / f) + world.texture % 877
+        cx = depth * (cos - sin * aside) + world.texture % 997
+        cy = depth * (sin + cos * aside) + world.texture % 877
         cloud = look_up(noise(2.6, 1), cx * 0.7, cy * 0.7)
         cover = np.clip(cloud * 0.55 + (light.clouds - 0.45) * 1.8, 0, 1) * np.minimum(1.0, elevation * 7 + 0.15)
         if light.clouds >= 1.0:
@@ -107,10 +125,23 @@ def _draw_sky(world: World) -> NDArray[np.uint8]:
         level = 1.0 if light.time == "day" else 0.55
         planes = [p + cover * (np.float32(b * level) - p) for p, b in zip(planes, bright, strict=True)]
     if light.sun and abs(light.azimuth) < 0.9:
-        glow = np.exp(-((side / f - math.tan(light.azimuth)) ** 2 + (elevation - 0.38) ** 2) * 18)
+        glow = np.exp(-((aside - math.tan(light.azimuth)) ** 2 + (elevation - 0.38) ** 2) * 18)
         planes = [p + glow * (255 - p) for p in planes]
-    azimuth = (np.arctan2(side[-1], f[-1]) + world.bearing + world.texture % 100).astype(np.float32)
-    lighting = Lighting(world)
+    return np.clip(cv2.merge(planes), 0, 255).astype(np.uint8)
+
+
+def _draw_skyline(world: World, image: NDArray[np.uint8], slope: Plane, azimuth: Plane, lighting: Lighting) -> None:
+    """Draw hills, then trees or houses, into the rows above the horizon.
+
+    Args:
+        world: What there is.
+        image: (h, W, 3) uint8, changed in place.
+        slope: (h, W) tangent of each pixel's elevation.
+        azimuth: (W,) direction of each column in radians.
+        lighting: Light and haze.
+    """
+    light = world.light
+    planes = [plane.astype(np.float32) for plane in cv2.split(image)]
     for layer, (tall, far) in enumerate(zip(world.skyline, (900.0, 230.0), strict=True)):
         if tall <= 0.004:
             continue
@@ -120,26 +151,20 @@ def _draw_sky(world: World) -> NDArray[np.uint8]:
             line = tall * (0.45 + 0.55 * np.abs(np.sin(block * 12.9898 + world.texture % 17)))
             colour: Colour = (120.0, 114.0, 108.0)
         else:
-            slope, scale = (3.2, 60.0) if layer == 0 else (1.9, 230.0 if world.texture % 2 else 110.0)
-            wave = look_up(noise(slope, 2 + layer), azimuth[None] * scale, azimuth[None] * 3 + layer * 99)[0]
+            roughness, scale = (3.2, 60.0) if layer == 0 else (1.9, 230.0 if world.texture % 2 else 110.0)
+            wave = look_up(noise(roughness, 2 + layer), azimuth[None] * scale, azimuth[None] * 3 + layer * 99)[0]
             line = tall * (0.62 + 0.22 * wave)
             colour = (84.0, 98.0, 92.0) if layer == 0 else (52.0, 64.0, 38.0)
         shade = lighting.tone(colour, far if light.weather != "fog" else far * 0.6, 200.0)
-        cover = np.clip((line.astype(np.float32)[None] - u / f) * np.float32(camera.fy) + 0.5, 0, 1)
+        cover = np.clip((line.astype(np.float32)[None] - slope) * np.float32(world.camera.fy) + np.float32(0.5), 0, 1)
+        bumps = np.float32(0.0)
         if layer == 1:
-            grain = look_up(noise(1.0, 5), np.broadcast_to(azimuth[None] * 350, u.shape), u / f * 350)
+            grain = look_up(noise(1.0, 5), np.broadcast_to(azimuth[None] * 350, slope.shape), slope * 350)
             depth = np.float32((0.12 if houses else 0.28) * math.exp(-light.haze * 230))
             bumps = depth * np.clip(grain, -1.5, 1.5)
-            planes = [
-                p + cover * (np.float32(c) + bumps * np.float32(b * a) - p)
-                for p, c, b, a in zip(planes, shade, colour, light.ambient, strict=True)
-            ]
-        else:
-            planes = [p + cover * (np.float32(c) - p) for p, c in zip(planes, shade, strict=True)]
-    image = np.empty((height, width, 3), np.uint8)
-    image[:] = np.clip(lighting.tone(world.layout.terrain, FAR, 50.0), 0, 255)
-    image[:limit] = np.clip(cv2.merge(planes), 0, 255)
-    return image
+        for plane, target, base, ambient in zip(planes, shade, colour, light.ambient, strict=True):
+            plane += cover * (np.float32(target) + bumps * np.float32(base * ambient) - plane)
+    image[:] = np.clip(cv2.merge(planes), 0, 255)
 
 
 def _draw_objects(

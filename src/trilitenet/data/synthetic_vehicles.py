@@ -371,7 +371,7 @@ def draw_vehicle(
 
     # Wheels and the dark underneath come first: the body hides their upper halves.
     under = 0.95 if shape.heavy and len(shape.parts) > 1 else 0.3
-    if rear_seen or front_seen:
+    if fine and (rear_seen or front_seen):
         x = 0.12 if rear_seen else shape.length - 0.12
         pen.polygon(_across(x, -half * 0.93, half * 0.93, 0.14, under), (26, 26, 28), 0.8)
     for axle, radius in shape.wheels:
@@ -379,21 +379,26 @@ def draw_vehicle(
             y = at * (half - 0.02)
             if at == side and sides_seen:
                 continue
-            x = axle - radius * 0.9 if rear_seen else axle + radius * 0.9
-            pen.polygon(_across(x, y - at * 0.24, y, radius * 0.56, radius * 1.5), _RUBBER)
+            if fine:
+                x = axle - radius * 0.9 if rear_seen else axle + radius * 0.9
+                pen.polygon(_across(x, y - at * 0.24, y, radius * 0.56, radius * 1.5), _RUBBER)
             pen.polygon(_across(axle, y - at * 0.24, y, 0.0, radius * 1.5), _RUBBER)
     order = sorted(shape.parts, key=lambda part: -abs(float(np.mean([x for x, _ in part.outline])) - eye[0]))
     for part in order:
         _draw_part(pen, part, eye, sun_local, sky, vehicle, fine, sides_seen, side)
     if sides_seen:
         for axle, radius in shape.wheels:
-            turn = np.linspace(0, 2 * math.pi, 14, endpoint=False)
+            turn = np.linspace(0, 2 * math.pi, 14 if fine else 7, endpoint=False)
             y = side * (half + 0.005)
             for share, colour in ((1.0, _RUBBER), (0.6, (120.0, 122.0, 126.0)), (0.2, (60.0, 60.0, 62.0))):
                 if share < 1 and not fine:
                     break
                 ring = np.stack(
-                    [axle + radius * share * np.cos(turn), np.full(14, y), radius + radius * share * np.sin(turn)],
+                    [
+                        axle + radius * share * np.cos(turn),
+                        np.full(len(turn), y),
+                        radius + radius * share * np.sin(turn),
+                    ],
                     axis=1,
                 )
                 pen.polygon(ring, colour)

@@ -172,6 +172,9 @@ class Camera:
         if given.shape[1] == 2:
             given = np.concatenate([given, np.zeros((len(given), 1))], axis=1)
         local = (given - (0.0, 0.0, self.height)) @ self.rotation
+        if not self.distortion and len(local) and local[:, 2].min() > 1e-3:
+            seen = local @ self.matrix.T
+            return np.asarray(seen[:, :2] / seen[:, 2:], np.float64)
         front = local[:, 2] > 1e-3
         depth = np.where(front, local[:, 2], np.nan)
         if self.distortion and len(given):
