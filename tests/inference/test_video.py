@@ -140,18 +140,34 @@ def test_failures_keep_their_place(tmp_path: Path) -> None:
 
 
 def test_stages_overlap() -> None:
-    """Reading, inference and drawing that take 10 ms each: together well under their sum."""
+    """Reading, inference and the caller's work are under way at the same time."""
+    lock = threading.Lock()
+    busy: set[str] = set()
+    seen: set[frozenset[str]] = set()
 
-    class Slow(ColourBackend):
+    def work(stage: str) -> None:
+        with lock:
+            busy.add(stage)
+            seen.add(frozenset(busy))
+        time.sleep(0.01)
+        with lock:
+            busy.discard(stage)
+
+    class BusyScenes(Scenes):
+        def _decode(self) -> Iterator[tuple[float, object]]:
+            for item in super()._decode():
+                work("read")
+                yield item
+
+    class BusyBackend(ColourBackend):
         def run(self, batch: np.ndarray) -> RawOutputs:
-            time.sleep(0.01 * len(batch))
+            work("infer")
             return super().run(batch)
 
-    began = time.perf_counter()
-    with PerceptionStream(Scenes(60, (32, 32), pause=0.01), Predictor(Slow(), long_side=32, batch_size=1)) as stream:
+    with PerceptionStream(BusyScenes(60, (32, 32)), Predictor(BusyBackend(), long_side=32, batch_size=1)) as stream:
         for _ in stream:
-            time.sleep(0.01)
-    assert time.perf_counter() - began < 0.75 * 60 * 0.03
+            work("draw")
+    assert frozenset({"read", "infer", "draw"}) in seen
 
 
 @pytest.mark.parametrize("size", [(96, 160), (97, 161), (1, 1)])
