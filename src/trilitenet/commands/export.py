@@ -147,6 +147,9 @@ def export(
         masks = "logit"
     network = load_network(model).eval()
     if format == "triton":
+        repository = output or Path("model_repository")
+        if (repository / Path(model).stem).exists() and not overwrite:
+            raise OutputError(f"{repository / Path(model).stem}: exists already; give another --output or --overwrite")
         with tempfile.TemporaryDirectory() as folder:
             exported = export(
                 model,
@@ -165,7 +168,6 @@ def export(
                 layout=layout,
                 frames=frames,
             )
-            repository = output or Path("model_repository")
             path = write_triton_repository(
                 exported.path, repository, network.card, name=Path(model).stem, overwrite=overwrite
             )
