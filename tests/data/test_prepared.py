@@ -70,7 +70,7 @@ def test_attributes_tasks_and_missing_labels(root: Path, tmp_path: Path) -> None
 def test_webdataset_reads_the_shards(root: Path, tmp_path: Path) -> None:
     """They are ordinary shards, for readers that know nothing of the index."""
     webdataset = pytest.importorskip("webdataset")
-    prepare(root, tmp_path / "out", canvas=CANVAS, splits=["val"])
+    prepare(root, tmp_path / "out", canvas=CANVAS, splits=["val"], images="jpeg")
     packed = PreparedDataset(tmp_path / "out", "val")
     shards = str(tmp_path / "out/val-000000.tar")
     for raw, sample in zip(webdataset.WebDataset(shards, shardshuffle=False).decode("rgb8"), packed, strict=True):

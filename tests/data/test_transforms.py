@@ -294,6 +294,8 @@ def test_hsv_agrees_with_the_formula() -> None:
     parts[..., 0] = (parts[..., 0] * gains[0]) % 180
     parts[..., 1:] = np.clip(parts[..., 1:] * gains[1:], 0, 255)
     np.testing.assert_array_equal(result, cv2.cvtColor(parts.astype(np.uint8), cv2.COLOR_HSV2RGB))
+    assert hsv(image, np.random.default_rng(7), Augmentation(), out=image) is not None
+    np.testing.assert_array_equal(image, result)
 
 
 def test_same_seed_same_sample() -> None:

@@ -337,7 +337,7 @@ def prepare(
     size: tuple[int, int] = (384, 640),
     splits: Sequence[str] = (),
     classes: Sequence[str] = (),
-    images: Literal["jpeg", "raw"] = "jpeg",
+    images: Literal["jpeg", "raw"] = "raw",
     quality: int = 95,
     mask_above: int = 1,
     shard_size: int = 1000,
@@ -353,7 +353,7 @@ def prepare(
         size: Height and width that training will use.
         splits: Prepare these splits alone.
         classes: Detection classes; those of the data set if left out.
-        images: ``jpeg`` is small; ``raw`` is about ten times larger and gives training exactly the same pixels.
+        images: ``raw`` gives training exactly the same pixels, and is quickest; ``jpeg`` takes a sixth of the room.
         quality: Of the JPEGs, of 100.
         mask_above: A resized mask pixel above this, of 255, is foreground; the published rule is 1.
         shard_size: Images a shard.

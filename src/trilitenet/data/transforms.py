@@ -220,30 +220,38 @@ def flip(sample: Sample) -> Sample:
     )
 
 
-def hsv(image: NDArray[np.uint8], rng: np.random.Generator, strength: Augmentation) -> NDArray[np.uint8]:
-    """Multiply hue, saturation and value of an RGB image by random gains (always three random numbers)."""
+def hsv(
+    image: NDArray[np.uint8], rng: np.random.Generator, strength: Augmentation, out: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
+    """Multiply hue, saturation and value of an RGB image by random gains (always three random numbers).
+
+    ``out`` is where the result goes, as in `shift_hsv`.
+    """
     gains = 1 + (2 * rng.random(3) - 1) * (strength.hue, strength.saturation, strength.value)
     if not (strength.hue or strength.saturation or strength.value):
         return image
-    return shift_hsv(image, (float(gains[0]), float(gains[1]), float(gains[2])))
+    return shift_hsv(image, (float(gains[0]), float(gains[1]), float(gains[2])), out)
 
 
-def shift_hsv(image: NDArray[np.uint8], gains: tuple[float, float, float]) -> NDArray[np.uint8]:
+def shift_hsv(
+    image: NDArray[np.uint8], gains: tuple[float, float, float], out: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
     """Multiply hue, saturation and value of an image by gains.
 
     Args:
         image: (H, W, 3) uint8 **RGB** (the published code runs this step with red and blue swapped).
         gains: Of hue (wraps round), saturation and value (both clipped).
+        out: Where to write, of the image's shape; may be ``image`` itself. Made if left out.
 
     Returns:
-        (H, W, 3) uint8 RGB, a new array.
+        (H, W, 3) uint8 RGB, ``out`` if it was given.
     """
     levels = np.arange(256, dtype=np.float64)
     table = np.empty((1, 256, 3), np.uint8)
     table[0, :, 0] = (levels * gains[0]) % 180
     table[0, :, 1] = np.clip(levels * gains[1], 0, 255)
     table[0, :, 2] = np.clip(levels * gains[2], 0, 255)
-    converted = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)
+    converted = cv2.cvtColor(image, cv2.COLOR_RGB2HSV, dst=out)
     cv2.LUT(converted, table, dst=converted)
     return cv2.cvtColor(converted, cv2.COLOR_HSV2RGB, dst=converted)  # type: ignore[no-any-return]
 
@@ -332,7 +340,7 @@ class TrainTransform:
             other = _alike(sample, rng, draw)
             if other is not None:
                 moved = mixup(moved, self._warp(other, rng), rng)
-        image = hsv(moved.image, rng, strength)
+        image = hsv(moved.image, rng, strength, out=moved.image)  # which nobody else has
         for name, step in _PHOTOMETRIC.items():
             probability = getattr(strength, name)
             if probability and rng.random() < probability:
