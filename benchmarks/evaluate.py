@@ -38,12 +38,15 @@ class Repeated:
         return self._dataset[index % len(self._dataset)]
 
 
-def infer(model: object, dataset: DrivingDataset, count: int) -> float:
-    start = time.perf_counter()
+def clock() -> tuple[float, float]:
+    """Seconds on the clock, and of processor time over all threads."""
+    return time.perf_counter(), time.process_time()
+
+
+def infer(model: object, dataset: DrivingDataset, count: int) -> None:
     for index in range(count):
         path = dataset.image_path(index % len(dataset))
         model.perceive([decode_image(path.read_bytes(), path.name)])  # type: ignore[attr-defined]
-    return time.perf_counter() - start
 
 
 def main() -> None:
@@ -70,19 +73,23 @@ def main() -> None:
         before = peak_memory()
         alone, scored = [], []
         for _ in range(arguments.rounds):
-            alone.append(infer(model, dataset, count))
-            start = time.perf_counter()
+            start = clock()
+            infer(model, dataset, count)
+            middle = clock()
             evaluate(model, Repeated(dataset, count), protocol=arguments.protocol)
-            scored.append(time.perf_counter() - start)
-        ratios = [second / first for first, second in zip(alone, scored, strict=True)]
+            end = clock()
+            alone.append([b - a for a, b in zip(start, middle, strict=True)])
+            scored.append([b - a for a, b in zip(middle, end, strict=True)])
         print(f"{arguments.model} ({model.backend.name}), {width}x{height}, {describe_hardware()}")
-        print(f"inference alone   {1000 * sum(alone) / count / len(alone):7.1f} ms a frame")
-        print(f"evaluation        {1000 * sum(scored) / count / len(scored):7.1f} ms a frame ({arguments.protocol})")
-        print(
-            f"ratio             {sum(scored) / sum(alone):7.2f} (rounds {', '.join(f'{one:.2f}' for one in ratios)}, "
-            f"median {statistics.median(ratios):.2f})"
-        )
-        print(f"peak memory       {peak_memory():7.0f} MiB (before the rounds {before:.0f})")
+        for which, name in enumerate(("clock", "processor")):
+            first, second = ([1000 * row[which] / count for row in rows] for rows in (alone, scored))
+            ratios = [after / before for before, after in zip(first, second, strict=True)]
+            print(
+                f"{name:9}  inference alone {statistics.median(first):6.1f} ms a frame, "
+                f"evaluation ({arguments.protocol}) {statistics.median(second):6.1f} ms, "
+                f"ratio {statistics.median(ratios):.2f} (rounds {', '.join(f'{one:.2f}' for one in ratios)})"
+            )
+        print(f"peak memory {peak_memory():.0f} MiB (before the rounds {before:.0f})")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from trilitenet.apps.cli import main
+from trilitenet.commands.compare import compare
+from trilitenet.commands.evaluate import evaluate
+from trilitenet.commands.score import score
+from trilitenet.config import ModelCard
+from trilitenet.data.synthetic_files import write_dataset
+from trilitenet.engine.report import Report
+from trilitenet.errors import ConfigError, DataError, OutputError
+from trilitenet.models.trilitenet import build_network
+from trilitenet.models.weights import save_network
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("data")
+    write_dataset(root, "val", 4, 0, size=(96, 160))
+    return root
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    save_network(build_network("tiny"), path, ModelCard("tiny", input_size=(96, 160)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(data: Path, weights: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Report, Path]:
+    folder = tmp_path_factory.mktemp("run")
+    report = evaluate(
+        str(weights), data=data, protocol="both", output=folder, save=folder / "predictions", resamples=20, worst=1
+    )
+    return report, folder
+
+
+def test_evaluating_writes_the_report_and_the_predictions(run: tuple[Report, Path], weights: Path) -> None:
+    report, folder = run
+    assert report.provenance.images == 4
+    assert report.provenance.canvas == ("160x96",)
+    assert report.provenance.model_sha256 == hashlib.sha256(weights.read_bytes()).hexdigest()
+    assert set(report.provenance.data_sha256) == {"images", "drivable", "lane", "boxes"}
+    assert len(set(report.provenance.data_sha256.values())) == 4
+    assert json.loads((folder / "report.json").read_text())["schema"] == 1
+    assert (folder / "report.html").stat().st_size > 10_000
+    assert len(list((folder / "predictions" / "lane").iterdir())) == 4
+
+
+def test_the_saved_predictions_score_the_same(run: tuple[Report, Path], data: Path) -> None:
+    report, folder = run
+    again = score(folder / "predictions", data=data, resamples=0, worst=0)
+    for key, figure in again.figures.items():
+        if "detection" not in key:  # coordinates are rounded to a thousandth of a pixel
+            assert figure.value == pytest.approx(report.figures[key].value, nan_ok=True), key
+    assert again.figures["fair/detection/ap50"].value == pytest.approx(
+        report.figures["fair/detection/ap50"].value, abs=0.01
+    )
+
+
+def test_reports_are_compared(run: tuple[Report, Path], data: Path, tmp_path: Path) -> None:
+    _, folder = run
+    score(folder / "predictions", data=data, resamples=0, worst=0, output=tmp_path / "scored")
+    comparison = compare(folder, tmp_path / "scored" / "report.json", published=True, output=tmp_path, resamples=20)
+    assert len(comparison.names) == 2
+    assert not comparison.unpaired
+    assert (tmp_path / "comparison.html").exists()
+    with pytest.raises(OutputError, match="--overwrite"):
+        compare(folder, output=tmp_path)
+    with pytest.raises(ConfigError, match="at least one"):
+        compare()
+
+
+def test_reports_are_not_overwritten_unasked(run: tuple[Report, Path], data: Path, weights: Path) -> None:
+    _, folder = run
+    with pytest.raises(OutputError, match="--overwrite"):
+        evaluate(str(weights), data=data, output=folder)
+    with pytest.raises(OutputError, match="--overwrite"):
+        evaluate(str(weights), data=data, save=folder / "predictions")
+    with pytest.raises(OutputError, match="--overwrite"):
+        score(folder / "predictions", data=data, output=folder)
+
+
+def test_sizes_and_corruptions_are_measured_too(data: Path, weights: Path) -> None:
+    report = evaluate(
+        str(weights), data=data, limit=1, resamples=0, worst=0, corruptions=True, severities=(1,), resolution=(96, 160)
+    )
+    names = [row.name for row in report.variations if not row.detail]
+    assert names[0] == "clean"
+    assert "fog" in names
+    assert names[-2:] == ["96", "160"]
+    assert len([row for row in report.variations if row.detail]) == 15
+
+
+def test_the_command_line(
+    run: tuple[Report, Path], data: Path, weights: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, folder = run
+    assert main(["evaluate", str(weights), "--data", str(data), "--limit", "2", "--resamples", "0"]) == 0
+    assert "fair protocol" in capsys.readouterr().out
+    assert main(["score", str(folder / "predictions"), "--data", str(data), "--protocol", "paper"]) == 0
+    assert "mean over batches" in capsys.readouterr().out
+    assert main(["compare", str(folder)]) == 0
+    assert "figures" in capsys.readouterr().out
+    assert main(["compare", str(folder / "nothing.json")]) == 1
+    assert main(["score", str(data), "--data", str(data)]) == 1
+    assert "no predictions" in capsys.readouterr().err
+
+
+def test_a_missing_split_is_told(data: Path, weights: Path) -> None:
+    with pytest.raises(DataError, match="images/test"):
+        evaluate(str(weights), data=data, split="test")
+
+
+def test_scoring_and_comparing_load_no_torch() -> None:
+    code = "import sys, trilitenet.commands.score, trilitenet.commands.compare; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
