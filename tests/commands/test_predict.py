@@ -256,22 +256,36 @@ def test_other_formats(format: str, folder: Path, tmp_path: Path, predictor: Pre
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are sent in another way")
-def test_ctrl_c_on_the_command_line(tmp_path: Path, weights: Path) -> None:
+def test_ctrl_c_in_a_process_of_its_own(tmp_path: Path) -> None:
     source, output = drive(tmp_path / "drive.mp4", frames=600), tmp_path / "out"
-    words = ["predict", str(source), "--output", str(output), "--model", str(weights), "--device", "cpu"]
+    script = f"""
+import sys, time
+from pathlib import Path
+from tests.fakes import ColourBackend
+from trilitenet.commands.predict import predict_with
+from trilitenet.inference.predictor import Predictor
+
+class Slow(ColourBackend):
+    def run(self, batch):
+        time.sleep(0.05)
+        return super().run(batch)
+
+report = predict_with(Predictor(Slow(), batch_size=1), [{str(source)!r}], Path({str(output)!r}))
+print(report.summary())
+sys.exit(report.exit_code)
+"""
     with subprocess.Popen(
-        [sys.executable, "-m", "trilitenet", *words],
+        [sys.executable, "-c", script],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background job ignores it
+        cwd=Path(__file__).parents[2],
     ) as process:
-        for _ in range(600):
-            if process.poll() is not None or (output / "drive.mp4.part").exists():
-                break
-            time.sleep(0.1)
+        until = time.monotonic() + 120
+        while process.poll() is None and not (output / "drive.mp4.part").exists() and time.monotonic() < until:
+            time.sleep(0.05)
         process.send_signal(signal.SIGINT)
-        printed, complaints = process.communicate(timeout=60)
+        printed, complaints = process.communicate(timeout=120)
     assert process.returncode == 130, complaints
     assert "interrupted: 1 video of" in printed
     frames = json.loads((output / "drive.json").read_text())["frames"]
