@@ -6,6 +6,7 @@ Whatever the number of workers, and whether an epoch is run through or taken up 
 from __future__ import annotations
 
 import dataclasses
+import multiprocessing
 from collections.abc import Iterator
 from typing import Any, Final
 
@@ -137,6 +138,10 @@ class Loader:
         self._drop_last = drop_last
         self._share = share
         self._plan = _Plan()
+        if workers:
+            # The workers are the parallelism. A forked one takes this over; setting it there would wait for ever for
+            # OpenCV's threads, which a fork leaves behind.
+            cv2.setNumThreads(0)
         more: dict[str, Any] = {"persistent_workers": True, "prefetch_factor": 4} if workers else {}
         self._loader: torch.utils.data.DataLoader[Batch] = torch.utils.data.DataLoader(
             _Samples(dataset, transform, seed),  # type: ignore[arg-type]
@@ -145,6 +150,7 @@ class Loader:
             num_workers=workers,
             pin_memory=pin_memory,
             worker_init_fn=_start_worker,
+            generator=torch.Generator(),  # else each start of an epoch would draw from the global one
             **more,
         )
 
@@ -240,5 +246,6 @@ def build_loader(
 
 
 def _start_worker(worker: int) -> None:
-    """Keep a worker to one core: the workers are the parallelism."""
-    cv2.setNumThreads(1)
+    """Keep a worker that was not forked to one core too."""
+    if multiprocessing.get_start_method() != "fork":
+        cv2.setNumThreads(0)

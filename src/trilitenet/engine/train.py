@@ -148,8 +148,7 @@ class Trainer:
         )
         compiled = torch.compile(self.network) if config.compile else self.network
         self.model, self.optimiser = fabric.setup(compiled, optimiser)
-        self.loss = fabric.setup_module(loss) if any(True for _ in loss.parameters()) else loss
-        self.plain_loss = loss
+        self.loss = loss
         self.teacher = teacher and tuple(part.to(fabric.device).eval() for part in teacher)
         self.ema = MovingAverage(self.network, config.ema_decay, config.ema_ramp) if config.ema_decay else None
         self.guard = FiniteGuard(self.network, optimiser, 20 if fabric.device.type == "cuda" else 1)
@@ -189,6 +188,20 @@ class Trainer:
             self.folder.mkdir(parents=True, exist_ok=True)
             (self.folder / "config.yaml").write_text(yaml.safe_dump(self.config.to_dict(), sort_keys=False))
             self.loggers = build_loggers(self.step)
+        try:
+            finished = self._run()
+        finally:
+            for logger in self.loggers:
+                logger.close()
+        weights = self.folder / "final.safetensors"
+        if finished and self.fabric.is_global_zero:
+            save_network(self.averaged, weights, self._card())
+        self.fabric.barrier()
+        speed = self.images / self.seconds if self.seconds else 0.0
+        return TrainResult(self.folder, weights, self.step, finished, self.metrics, self.best, speed)
+
+    def _run(self) -> bool:
+        """Run the epochs; return whether the end was reached, by schedule or by early stopping."""
         with StopRequest() as stop:
             while self.step < self.steps and not self._stopped(stop) and not self._stalled():
                 epoch, start = divmod(self.step, self.epoch_steps)
@@ -196,17 +209,8 @@ class Trainer:
                 if self._stopped(stop):
                     break
                 self._end_epoch(epoch)
-            finished = not self._stopped(stop)
             self.save()
-        weights = self.folder / "final.safetensors"
-        if self.fabric.is_global_zero:
-            if finished:
-                save_network(self.averaged, weights, self._card())
-            for logger in self.loggers:
-                logger.close()
-        self.fabric.barrier()
-        speed = self.images / self.seconds if self.seconds else 0.0
-        return TrainResult(self.folder, weights, self.step, finished, self.metrics, self.best, speed)
+            return not self._stopped(stop)
 
     @property
     def averaged(self) -> TriLiteNet:
@@ -248,6 +252,9 @@ class Trainer:
                 terms = self._losses(batch.to(self.fabric.device, non_blocking=True))
                 self.fabric.backward(terms.total / len(batches))
             sums[:-1] += torch.stack([term.detach() for term in terms]) / len(batches)
+        if self.fabric.world_size > 1:
+            for parameter in self.loss.parameters():
+                parameter.grad = self.fabric.all_reduce(parameter.grad)
         norm = self.fabric.clip_gradients(
             self.model, self.optimiser, max_norm=self.config.clip_gradient or math.inf, error_if_nonfinite=False
         )
@@ -359,7 +366,7 @@ class Trainer:
                 "network": self.network.state_dict(),
                 "ema": None if self.ema is None else self.ema.state_dict(),
                 "optimiser": self.optimiser.state_dict(),
-                "loss": self.plain_loss.state_dict(),
+                "loss": self.loss.state_dict(),
                 "scaler": self._scaler_state(),
                 "best": self.best,
                 "metrics": self.metrics,
@@ -384,12 +391,12 @@ class Trainer:
                     "set it alike, or start anew with --init"
                 )
         self.network.load_state_dict(state["network"])
-        if self.plain_loss.detection is not None:
-            self.plain_loss.detection.anchors.copy_(self.network.anchors)
+        if self.loss.detection is not None:
+            self.loss.detection.anchors.copy_(self.network.anchors)
         if self.ema is not None and state["ema"] is not None:
             self.ema.load_state_dict(state["ema"])
         self.optimiser.load_state_dict(state["optimiser"])
-        self.plain_loss.load_state_dict(state["loss"])
+        self.loss.load_state_dict(state["loss"])
         if state.get("scaler"):
             self.fabric._precision.load_state_dict(state["scaler"])
         self.step, self.stale = int(state["step"]), int(state.get("stale", 0))

@@ -1,0 +1,290 @@
+"""Training end to end on a few small synthetic scenes."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+
+import trilitenet
+from trilitenet.commands.train import train
+from trilitenet.commands.train_table import train_table
+from trilitenet.data.synthetic_files import write_dataset
+from trilitenet.engine import train as engine
+from trilitenet.engine.checkpoint import read_checkpoint
+from trilitenet.engine.loggers import CsvLogger, read_csv
+from trilitenet.engine.recipe import read_recipe
+from trilitenet.errors import ConfigError, OutputError, TrainingError, WeightsError
+from trilitenet.models.trilitenet import TriLiteNet
+from trilitenet.models.weights import load_network, read_card
+
+pytest.importorskip("lightning_fabric")
+
+RECIPES = sorted(
+    path for path in (Path(__file__).resolve().parents[2] / "recipes").rglob("*.yaml") if path.parent.name != "tables"
+)
+TABLES = sorted((Path(__file__).resolve().parents[2] / "recipes" / "tables").glob("*.yaml"))
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("scenes")
+    write_dataset(root, "train", 10, 0, size=(96, 160))
+    write_dataset(root, "val", 3, 1, size=(96, 160))
+    return root
+
+
+def settings(scenes: Path, output: Path, **more: Any) -> dict[str, Any]:
+    return {
+        "data": str(scenes),
+        "output": str(output),
+        "input_size": (64, 128),
+        "batch_size": 4,
+        "epochs": 10,
+        "warmup_steps": 4,
+        "workers": 0,
+        "val_split": "",
+        "device": "cpu",
+        "precision": "32-true",
+        "loggers": ("csv",),
+        "log_every": 1,
+        "auto_anchor": False,
+        **more,
+    }
+
+
+def state(folder: Path) -> dict[str, Any]:
+    whole = read_checkpoint(folder / "last.ckpt")
+    return {key: value for key, value in whole.items() if key not in {"config", "metrics"}}
+
+
+def same(first: Any, second: Any, path: str = "") -> None:
+    """Compare nested states bit for bit."""
+    if isinstance(first, dict):
+        assert first.keys() == second.keys(), path
+        for key in first:
+            same(first[key], second[key], f"{path}/{key}")
+    elif isinstance(first, (list, tuple)):
+        assert len(first) == len(second), path
+        for index, (a, b) in enumerate(zip(first, second, strict=True)):
+            same(a, b, f"{path}/{index}")
+    elif isinstance(first, torch.Tensor):
+        assert torch.equal(first, second), path
+    else:
+        assert first == second, path
+
+
+@pytest.mark.slow
+def test_resume_is_bit_for_bit(scenes: Path, tmp_path: Path) -> None:
+    options = {"workers": 2, "multi_scale": (0.8, 1.6), "precision": "bf16-mixed", "balancing": "uncertainty"}
+    train(**settings(scenes, tmp_path / "straight", max_steps=20, **options))
+    for steps in (9, 20):  # two steps an epoch: step 9 is in the middle of one
+        result = train(resume=steps > 9, **settings(scenes, tmp_path / "parts", max_steps=steps, **options))
+        assert result.steps == steps
+    same(state(tmp_path / "straight"), state(tmp_path / "parts"))
+    rows = [read_csv(tmp_path / name / "metrics.csv") for name in ("straight", "parts")]
+    curves = [[row for row in part if row[1] != "images_per_second"] for part in rows]
+    assert curves[0] == curves[1]
+
+
+def test_accumulation_sees_the_same_images(scenes: Path, tmp_path: Path) -> None:
+    for passes in (1, 2):
+        train(**settings(scenes, tmp_path / str(passes), max_steps=1, accumulate=passes))
+    losses = [{row[1]: row[2] for row in read_csv(tmp_path / str(n) / "metrics.csv")} for n in (1, 2)]
+    assert losses[0]["train/objectness"] == pytest.approx(losses[1]["train/objectness"], rel=0.05)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_saves_and_ends_cleanly(
+    scenes: Path, tmp_path: Path, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = signal.getsignal(number)
+    plain = CsvLogger.log
+
+    def log(self: CsvLogger, values: Any, step: int) -> None:
+        plain(self, values, step)
+        if step == 3:
+            os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(CsvLogger, "log", log)
+    result = train(**settings(scenes, tmp_path, max_steps=6))
+    assert (result.finished, result.steps, result.exit_code) == (False, 3, 130)
+    assert "--resume" in result.summary()
+    assert state(tmp_path)["step"] == 3
+    assert not result.weights.exists()
+    assert signal.getsignal(number) == before
+    monkeypatch.setattr(CsvLogger, "log", plain)
+    assert train(resume=True, **settings(scenes, tmp_path, max_steps=6)).finished
+
+
+def test_validation_keeps_the_best_and_the_page(scenes: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    options = settings(scenes, tmp_path, val_split="val", epochs=1, max_steps=2, auto_anchor=True, pictures=1)
+    result = trilitenet.train(**options)
+    assert set(result.best) <= {"detection", "drivable", "lane", "overall"}
+    assert {"detection/ap50", "detection/recall", "drivable/miou", "lane/accuracy", "lane/iou"} <= set(result.metrics)
+    card = read_card(result.weights)
+    assert card.metrics["val drivable/miou"] == result.metrics["drivable/miou"]
+    assert card.input_size == (64, 128)
+    for name in result.best:
+        assert read_card(tmp_path / f"best-{name}.safetensors").metrics[f"best {name}"] == result.best[name]
+    assert (tmp_path / "results" / "index.html").exists()
+    assert read_recipe(tmp_path / "config.yaml").input_size == (64, 128)
+    anchors = load_network(result.weights).anchors
+    torch.testing.assert_close(anchors, read_checkpoint(tmp_path / "last.ckpt")["network"]["anchors"])
+
+
+def test_the_best_is_never_replaced_by_a_worse_one(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = iter([0.5, 0.7, 0.6, 0.8])
+
+    def validation(*_: Any) -> Any:
+        return lambda network: {"drivable/miou": next(values)}
+
+    monkeypatch.setattr("trilitenet.commands.train._validation", validation)
+    options = settings(scenes, tmp_path, val_split="val", tasks=("drivable",), pictures=0)
+    train(**options, max_steps=4)
+    (tmp_path / "last.ckpt").rename(tmp_path / "kept")
+    train(overwrite=True, **options | {"epochs": 10}, max_steps=2)
+    assert read_card(tmp_path / "best-drivable.safetensors").metrics["best drivable"] == 0.6
+    train(resume=True, **options, max_steps=4)
+    assert read_card(tmp_path / "best-drivable.safetensors").metrics["best drivable"] == 0.8
+
+
+def test_stops_early(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trilitenet.commands.train._validation", lambda *_: lambda network: {"drivable/miou": 0.5})
+    options = settings(scenes, tmp_path, val_split="val", tasks=("drivable",), patience=2, pictures=0)
+    result = train(**options)
+    assert result.finished
+    assert result.steps == 6  # one good validation and two no better, two steps an epoch
+
+
+def test_transfer_freeze_and_distil(scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first = train(**settings(scenes, tmp_path / "teacher", max_steps=1))
+    options = {"init": str(first.weights), "teacher": str(first.weights), "freeze": ("encoder",)}
+    second = train(**settings(scenes, tmp_path / "student", max_steps=2, tasks=("drivable",), **options))
+    assert "surplus: " in capsys.readouterr().err
+    ours, theirs = load_network(second.weights), load_network(first.weights)
+    assert ours.tasks == ("drivable",)
+    for name, tensor in ours.encoder.state_dict().items():
+        torch.testing.assert_close(tensor, theirs.encoder.state_dict()[name], rtol=0, atol=1e-6)
+    assert read_card(second.weights).provenance["teacher"] == "final.safetensors"
+
+
+def test_not_finite_steps_are_left_out_and_end_the_run(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    plain, calls = TriLiteNet.forward, iter(range(100))
+    poisoned = {1}
+
+    def forward(self: TriLiteNet, image: torch.Tensor) -> Any:
+        return plain(self, image * float("nan") if next(calls) in poisoned else image)
+
+    monkeypatch.setattr(TriLiteNet, "forward", forward)
+    result = train(**settings(scenes, tmp_path / "one", max_steps=3))
+    assert result.finished
+    assert "step 1 skipped" in caplog.text
+    assert all(bool(value.isfinite().all()) for value in load_network(result.weights).state_dict().values())
+    poisoned.update(range(100))
+    with pytest.raises(TrainingError, match="10 steps in a row"):
+        train(**settings(scenes, tmp_path / "all"))
+
+
+def test_refusals(scenes: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no data"):
+        train()
+    with pytest.raises(ConfigError, match="did you mean 'epochs'"):
+        train(epoch=3)
+    with pytest.raises(WeightsError, match="no such checkpoint"):
+        train(resume=True, **settings(scenes, tmp_path / "none"))
+    train(**settings(scenes, tmp_path, max_steps=1))
+    with pytest.raises(OutputError, match="holds a run already"):
+        train(**settings(scenes, tmp_path, max_steps=1))
+    with pytest.raises(WeightsError, match="variant 'tiny', this run has 'small'"):
+        train(resume=True, **settings(scenes, tmp_path, max_steps=2, variant="small"))
+    with pytest.raises(WeightsError, match="class count 1, this run has 2"):
+        train(resume=True, **settings(scenes, tmp_path, max_steps=2, classes=("vehicle", "person")))
+
+
+@pytest.mark.parametrize("recipe", RECIPES, ids=lambda path: path.stem)
+def test_every_recipe_runs_three_steps(recipe: Path, scenes: Path, tmp_path: Path) -> None:
+    result = train(recipe, **settings(scenes, tmp_path, epochs=2, max_steps=3, batch_size=2))
+    assert result.steps == 3
+    assert recipe.read_text().startswith("# ")
+    assert "Measured result" in recipe.read_text()
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda path: path.stem)
+def test_every_table_names_recipes_that_exist(table: Path) -> None:
+    for recipe in yaml.safe_load(table.read_text())["rows"].values():
+        read_recipe(table.parent / recipe)
+
+
+def test_a_table_is_trained_once_and_printed(scenes: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    (tmp_path / "a.yaml").write_text("tasks: [drivable]\nvariant: tiny\n")
+    (tmp_path / "b.yaml").write_text("base: a.yaml\npcaa: false\n")
+    table = tmp_path / "t.yaml"
+    table.write_text("title: Parts\nrows: {With: a.yaml, Without: b.yaml}\n")
+    more = settings(scenes, tmp_path, max_steps=1, val_split="val", epochs=1, pictures=0)
+    more = {key: list(value) if isinstance(value, tuple) else value for key, value in more.items()}
+    more.pop("data"), more.pop("output")
+    for _ in range(2):
+        result = train_table(table, data=scenes, output=tmp_path / "runs", settings=yaml.safe_dump(more))
+    text = result.summary()
+    assert re.search(r"\| With \| - \| - \| \d+\.\d \| - \| - \| 0\.0\d \| 0\.0\d \|", text)
+    assert result.rows[1].parameters < result.rows[0].parameters
+    assert result.exit_code == 0
+
+
+def test_the_command_line_takes_every_field(scenes: Path, tmp_path: Path) -> None:
+    recipe = tmp_path / "r.yaml"
+    recipe.write_text(yaml.safe_dump({"data": str(scenes), "input_size": [64, 128], "device": "cpu", "val_split": ""}))
+    words = ["train", str(recipe), "--output", str(tmp_path / "run"), "--max-steps", "1", "--batch-size", "2"]
+    words += ["--workers", "0", "--augmentation.flip", "0", "--no-spp", "--betas", "0.8", "0.9", "--loggers", "csv"]
+    words += ["--sampling", "{timeofday: {night: 2}}", "--precision", "32-true"]
+    from trilitenet.apps.cli import main
+
+    assert main(words) == 0
+    config = read_recipe(tmp_path / "run" / "config.yaml")
+    assert (config.augmentation.flip, config.spp, config.betas) == (0.0, False, (0.8, 0.9))
+    assert config.sampling == {"timeofday": {"night": 2.0}}
+    assert read_card(tmp_path / "run" / "final.safetensors").blocks == ("pcaa", "litepan")
+
+
+@pytest.mark.slow
+def test_two_processes_follow_one(scenes: Path, tmp_path: Path) -> None:
+    """Same batches of four, whole or two and two; batch statistics and the region of Tversky are a process's own."""
+    curves = {}
+    for devices in (1, 2):
+        config = settings(scenes, tmp_path / str(devices), max_steps=6, devices=devices, lr=1e-3)
+        recipe = tmp_path / f"{devices}.yaml"
+        recipe.write_text(
+            yaml.safe_dump({key: list(value) if isinstance(value, tuple) else value for key, value in config.items()})
+        )
+        done = subprocess.run(
+            [sys.executable, "-m", "trilitenet", "train", str(recipe)],
+            check=False,
+            capture_output=True,
+            text=True,
+            timeout=280,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )
+        assert done.returncode == 0, done.stderr
+        rows = read_csv(tmp_path / str(devices) / "metrics.csv")
+        curves[devices] = [value for _, name, value in rows if name == "train/total"]
+    assert len(curves[1]) == len(curves[2]) == 6
+    assert curves[2] == pytest.approx(curves[1], rel=0.1)
+
+
+def test_engine_names_the_figures_validation_returns() -> None:
+    assert set(engine.FIGURES) == {"detection", "drivable", "lane"}
