@@ -11,8 +11,10 @@ from tests.data.published import write_published
 from tests.formats.readers import raw_bdd
 from trilitenet.apps.cli import main
 from trilitenet.commands.data import check, convert, prepare, show
+from trilitenet.commands.train import _training_data
 from trilitenet.data.prepared import PreparedDataset, open_dataset
 from trilitenet.data.reading import DrivingDataset
+from trilitenet.engine.recipe import TrainConfig
 from trilitenet.errors import ConfigError, DataError, OutputError
 
 
@@ -118,3 +120,9 @@ def test_prepare_and_read_back(published: Path, tmp_path: Path, capsys: pytest.C
     assert not result.by_itself
     with pytest.raises(DataError, match="prepared data set"):
         show(tmp_path / "out", tmp_path / "x.png")
+
+
+def test_training_uses_the_prepared_copy(published: Path) -> None:
+    assert isinstance(_training_data(TrainConfig(data=str(published))), DrivingDataset)
+    prepare(published, workers=1)
+    assert isinstance(_training_data(TrainConfig(data=str(published))), PreparedDataset)

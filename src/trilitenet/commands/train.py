@@ -20,6 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from trilitenet.config import DEFAULT_ANCHORS, ModelCard
 from trilitenet.data.loader import build_loader
+from trilitenet.data.prepared import open_dataset
 from trilitenet.data.reading import DrivingDataset, MixedDataset, SampleSource, sampling_weights
 from trilitenet.data.sample import Sample
 from trilitenet.data.transforms import TrainTransform
@@ -119,12 +120,12 @@ def train(
 
 
 def _training_data(config: TrainConfig) -> SampleSource:
-    first = DrivingDataset(config.data, config.train_split, class_names=config.classes)
+    first = open_dataset(config.data, config.train_split, canvas=config.input_size, class_names=config.classes)
     if not config.extra_data:
         return first
     names = first.class_names
     more = [
-        (DrivingDataset(root, config.train_split, class_names=names), weight)
+        (open_dataset(root, config.train_split, canvas=config.input_size, class_names=names), weight)
         for root, weight in config.extra_data.items()
     ]
     return MixedDataset([(first, 1.0), *more])
