@@ -59,7 +59,8 @@ def rest_router(service: Service) -> APIRouter:
             image = await _one_image(request, service, reservation)
             finish = _finisher(output, request, service)
             with service.admit(1) as deadline:
-                return await until_vanished(request, service.see(image, deadline, finish, confidence))
+                work = service.see(image, deadline, finish, confidence, keep_image=output == "overlay")
+                return await until_vanished(request, work)
 
     @router.post("/v1/predict/batch", tags=["prediction"], **openapi.PREDICT_BATCH)
     async def predict_batch(request: Request, confidence: Confidence = None) -> Response:

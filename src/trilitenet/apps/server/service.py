@@ -49,12 +49,12 @@ class Outcome:
 
     Attributes:
         perception: In pixels of the image.
-        image: (height, width, 3) uint8 RGB.
+        image: (height, width, 3) uint8 RGB, if it was to be kept.
         milliseconds: By stage.
     """
 
     perception: Perception
-    image: NDArray[np.uint8]
+    image: NDArray[np.uint8] | None
     milliseconds: dict[str, float]
 
 
@@ -142,6 +142,8 @@ class Service:
         deadline: float,
         finish: Callable[[Outcome], _T],
         confidence: float | None = None,
+        *,
+        keep_image: bool = False,
     ) -> _T:
         """Take an admitted image through all stages.
 
@@ -150,6 +152,7 @@ class Service:
             deadline: What `admit` gave.
             finish: Makes the answer of the outcome, in a thread.
             confidence: Replaces the model's threshold for boxes.
+            keep_image: Hand the image to ``finish``; else only its small canvas waits for the network.
 
         Raises:
             BusyError: If it is not through by the deadline.
@@ -161,7 +164,7 @@ class Service:
             predictor = Predictor(predictor.backend, thresholds, long_side=predictor.long_side)
         try:
             return await asyncio.wait_for(
-                self._stages(image, deadline, finish, predictor), timeout=deadline - time.monotonic()
+                self._stages(image, deadline, finish, predictor, keep_image), timeout=deadline - time.monotonic()
             )
         except asyncio.TimeoutError:
             raise _too_late() from None
@@ -186,9 +189,10 @@ class Service:
         deadline: float,
         finish: Callable[[Outcome], _T],
         predictor: Predictor,
+        keep_image: bool,
     ) -> _T:
         loop = asyncio.get_running_loop()
-        pixels, canvas, letterbox, milliseconds = await self.in_pool(self._prepare, image, deadline)
+        pixels, canvas, letterbox, milliseconds = await self.in_pool(self._prepare, image, deadline, keep_image)
         raw, waited, ran = await asyncio.wrap_future(self._batcher.submit(canvas, deadline))
         self._note(milliseconds, "queue", waited)
         self._note(milliseconds, "network", ran)
@@ -196,8 +200,8 @@ class Service:
         return await loop.run_in_executor(self._outcome, call)
 
     def _prepare(
-        self, image: Encoded | NDArray[np.uint8], deadline: float
-    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Letterbox, dict[str, float]]:
+        self, image: Encoded | NDArray[np.uint8], deadline: float, keep_image: bool
+    ) -> tuple[NDArray[np.uint8] | None, NDArray[np.uint8], Letterbox, dict[str, float]]:
         start = time.monotonic()
         if start > deadline:
             raise _too_late()
@@ -210,13 +214,13 @@ class Service:
         start = time.monotonic()
         canvas, letterbox = self.predictor.preprocess(pixels)
         self._note(milliseconds, "preprocess", time.monotonic() - start)
-        return pixels, canvas, letterbox, milliseconds
+        return pixels if keep_image else None, canvas, letterbox, milliseconds
 
     def _answer(
         self,
         raw: RawOutputs,
         letterbox: Letterbox,
-        pixels: NDArray[np.uint8],
+        pixels: NDArray[np.uint8] | None,
         milliseconds: dict[str, float],
         predictor: Predictor,
         finish: Callable[[Outcome], _T],
