@@ -42,8 +42,8 @@ def test_what_is_written_is_read_again(tmp_path: Path, rng: np.random.Generator)
         np.testing.assert_allclose(again.boxes.xyxy, one.boxes.xyxy, atol=1e-3)
         np.testing.assert_allclose(again.boxes.confidence, one.boxes.confidence, rtol=1e-6)
         assert (again.boxes.class_id == one.boxes.class_id).all()
-        assert (again.drivable == one.drivable).all()
-        assert (again.lane == one.lane).all()
+        np.testing.assert_array_equal(again.drivable, one.drivable)
+        np.testing.assert_array_equal(again.lane, one.lane)
 
 
 def test_the_form_on_disk(tmp_path: Path) -> None:
@@ -57,7 +57,8 @@ def test_the_form_on_disk(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "detections.json").read_text()) == [
         {"image_id": "a", "category_id": 1, "bbox": [1.0, 2.0, 3.0, 5.0], "score": 0.5}
     ]
-    assert cv2.imread(str(tmp_path / "lane" / "a.png"), cv2.IMREAD_UNCHANGED).tolist() == [[255, 0, 0], [0, 255, 0]]
+    lane = cv2.imread(str(tmp_path / "lane" / "a.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(lane, [[255, 0, 0], [0, 255, 0]])
     assert not (tmp_path / "drivable").exists()
 
 

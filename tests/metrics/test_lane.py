@@ -124,7 +124,7 @@ def test_published_area_resizing_lifts_that_score_to_about_two_fifths() -> None:
     letterbox = Letterbox.fit((720, 1280))
     small = [letterbox.mask(mask * np.uint8(255)) for mask in (prediction, truth)]
     metric = LaneMetric()
-    metric.update(small[0], small[1])  # type: ignore[arg-type]
+    metric.update(small[0], small[1])
     assert 0.35 < metric.compute().as_labelled.iou < 0.45
 
 
