@@ -6,9 +6,13 @@ import os
 import random
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+
+if TYPE_CHECKING:
+    from tests.artefacts import Artefacts
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -37,3 +41,11 @@ def driving() -> Path:
     if not (root / "images").is_dir():
         pytest.skip("the driving frames are not here; TRILITENET_DATA names their folder")
     return root
+
+
+@pytest.fixture(scope="session")
+def artefacts(tmp_path_factory: pytest.TempPathFactory) -> Artefacts:
+    """Exported files of a small network; skips where the runtimes are absent."""
+    from tests.artefacts import make_artefacts
+
+    return make_artefacts(tmp_path_factory.mktemp("artefacts"))

@@ -88,7 +88,8 @@ def test_classes(classes: int) -> None:
 
 @pytest.mark.parametrize("part", ["pcaa", "litepan", "spp"])
 def test_ablated_networks(part: str) -> None:
-    check(lively_network(**{part: False}))
+    options: dict[str, Any] = {part: False}
+    check(lively_network(**options))
 
 
 def test_batches() -> None:

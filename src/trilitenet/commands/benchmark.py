@@ -270,7 +270,7 @@ class _Meter:
         self._read: Callable[[], float] | None = None
         for rapl in sorted(Path("/sys/class/powercap").glob("*-rapl:0/energy_uj")):
             if os.access(rapl, os.R_OK):
-                self._read = lambda rapl=rapl: int(rapl.read_text(encoding="ascii")) / 1e6  # type: ignore[misc]
+                self._read = lambda rapl=rapl: int(rapl.read_text(encoding="ascii")) / 1e6
         try:
             import pynvml
 

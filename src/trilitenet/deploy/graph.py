@@ -148,9 +148,9 @@ class DetectionGraph(nn.Module):
         if self.paths:
             self.top_down = nn.ModuleList(SeparableGraph(block) for block in litepan.top_down)  # type: ignore[arg-type]
             self.bottom_up = nn.ModuleList(SeparableGraph(block) for block in litepan.bottom_up)  # type: ignore[arg-type]
-            self.smooth = nn.ModuleList(FusedConv(conv_kernel(block.depthwise)) for block in litepan.smooth)  # type: ignore[arg-type, union-attr]
+            self.smooth = nn.ModuleList(FusedConv(conv_kernel(block.depthwise)) for block in litepan.smooth)  # type: ignore[arg-type]
             heads = [
-                compose_pointwise(conv_kernel(block.pointwise), last)  # type: ignore[arg-type, union-attr]
+                compose_pointwise(conv_kernel(block.pointwise), last)  # type: ignore[arg-type]
                 for block, last in zip(litepan.smooth, heads, strict=True)
             ]
         else:

@@ -74,6 +74,7 @@ class Parity:
             parts.append(f"boxes in both {self.boxes:.4f} (sides {self.box_error:.2f} px apart)")
         return "parity: " + ", ".join(parts)
 
+
 LIMIT: Final = 300
 """At most so many boxes of a frame are looked for, the most confident."""
 

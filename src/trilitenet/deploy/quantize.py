@@ -59,7 +59,7 @@ def quantize_openvino(model: Any, images: Sequence[NDArray[Any]], keep: Sequence
         MissingExtraError: If NNCF is not installed.
     """
     _check(images)
-    nncf = import_extra("nncf", "openvino")
+    nncf = import_extra("nncf", "int8")
     names = [node.get_friendly_name() for node in model.get_ops() if node.get_type_name() != "Constant"]
     with _quiet():
         nncf.set_log_level(logging.ERROR)

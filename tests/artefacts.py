@@ -1,0 +1,49 @@
+"""Exported artefacts for tests, made once a session."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from trilitenet.config import ArtefactInfo, Thresholds
+
+SIZE = (64, 128)
+
+
+@dataclasses.dataclass(frozen=True)
+class Artefacts:
+    """Files of one small-input tiny network, and what it returns.
+
+    Attributes:
+        folder: Holds weights.safetensors, model.onnx and model.xml.
+        images: (2, 64, 128, 3) uint8 RGB.
+    """
+
+    folder: Path
+    images: NDArray[np.uint8]
+
+
+def make_artefacts(folder: Path) -> Artefacts:
+    pytest.importorskip("onnxscript")
+    pytest.importorskip("openvino")
+    from tests.deploy.networks import lively_network
+    from trilitenet.deploy.graph import DeployGraph
+    from trilitenet.deploy.layouts import LAYOUTS
+    from trilitenet.deploy.onnx import build_onnx, save_onnx
+    from trilitenet.deploy.openvino import build_openvino, save_openvino
+    from trilitenet.models.weights import save_network
+
+    network = lively_network(classes=2)
+    card = dataclasses.replace(network.card, thresholds=Thresholds(confidence=0.4, lane=0.49), licence="MIT")
+    network.card = card
+    save_network(network, folder / "weights.safetensors", card)
+    info = ArtefactInfo("onnx", size=SIZE, trilitenet="0")
+    model = build_onnx(DeployGraph(network, LAYOUTS["heads"]), card, info)
+    save_onnx(model, folder / "model.onnx")
+    info = dataclasses.replace(info, format="openvino", precision="bf16")
+    save_openvino(build_openvino(model), folder / "model.xml", card, info)
+    return Artefacts(folder, np.random.default_rng(0).integers(0, 256, (2, *SIZE, 3), np.uint8))

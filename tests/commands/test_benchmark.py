@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.artefacts import Artefacts
+from trilitenet.commands.benchmark import benchmark
+from trilitenet.errors import ConfigError
+
+
+def test_models_take_turns(artefacts: Artefacts, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    weights, xml = (str(artefacts.folder / name) for name in ("weights.safetensors", "model.xml"))
+    result = benchmark(
+        weights,
+        xml,
+        batch=(1, 2),
+        rounds=3,
+        warmup=0,
+        size=(64, 128),
+        output=tmp_path / "a.json",
+        plot=tmp_path / "a.png",
+    )
+    assert [(row.model, row.batch) for row in result.timings] == [
+        ("weights.safetensors", 1),
+        ("weights.safetensors", 2),
+        ("model.xml", 1),
+        ("model.xml", 2),
+    ]
+    assert result.timings[0].ratio == 1
+    for row in result.timings:
+        assert 0 < row.p50 <= row.p90 <= row.p99
+        assert row.frames_per_second == pytest.approx(1e3 * row.batch / row.p50)
+        assert row.first_result > 0
+    assert json.loads((tmp_path / "a.json").read_text())["rounds"] == 3
+    assert (tmp_path / "a.png").stat().st_size > 1000
+    assert "| model.xml | openvino cpu" in result.summary()
+
+
+def test_whole_frames(artefacts: Artefacts) -> None:
+    result = benchmark(str(artefacts.folder / "model.xml"), stage="frame", rounds=2, warmup=0, source=(90, 160))
+    assert result.timings[0].stage == "frame"
+
+
+def test_cost_table() -> None:
+    result = benchmark(table="cost", size=(64, 128))
+    assert [cost.parameters for cost in result.costs] == [151_413, 592_338, 2_350_206]
+    assert "| tiny | 0.151 |" in result.summary()
+
+
+def test_numbers_must_be_positive() -> None:
+    with pytest.raises(ConfigError, match="at least 1"):
+        benchmark(rounds=0)

@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import trilitenet
+from tests.artefacts import Artefacts
+from trilitenet.commands.export import export
+from trilitenet.deploy.parity import TOLERANCES, Tolerance
+from trilitenet.errors import BackendError, ConfigError, OutputError
+
+
+@pytest.fixture
+def frames(tmp_path: Path, rng: np.random.Generator) -> Path:
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for index in range(2):
+        pixels = rng.integers(0, 256, (60, 120, 3), np.uint8)
+        Image.fromarray(pixels).save(folder / f"{index}.png")
+    return folder
+
+
+def test_options_that_do_not_fit(artefacts: Artefacts, tmp_path: Path) -> None:
+    weights = str(artefacts.folder / "weights.safetensors")
+    cases: tuple[tuple[dict[str, Any], str], ...] = (
+        ({"precision": "bf16"}, "onnx artefacts come as"),
+        ({"precision": "int8"}, "--calibration"),
+        ({"size": "100x64"}, "multiples of 32"),
+        ({"size": "big"}, "HEIGHTxWIDTH"),
+        ({"format": "torch", "nms": True}, "--nms"),
+        ({"max_drop": 0.5}, "--max-drop"),
+        ({"output": tmp_path / "a.xml"}, "end with .onnx"),
+    )
+    for options, message in cases:
+        with pytest.raises(ConfigError, match=message):
+            export(weights, **options)
+    (tmp_path / "a.onnx").touch()
+    with pytest.raises(OutputError, match="exists already"):
+        export(weights, output=tmp_path / "a.onnx")
+
+
+@pytest.mark.slow
+def test_openvino_with_synthetic_frames(artefacts: Artefacts, tmp_path: Path) -> None:
+    path = tmp_path / "made" / "model.xml"
+    done = export(str(artefacts.folder / "weights.safetensors"), format="openvino", size="64x128", output=path)
+    assert done.parity is not None
+    assert done.parity.pixels is not None
+    assert done.parity.pixels > 0.9999
+    assert sorted(file.name for file in path.parent.iterdir()) == ["model.bin", "model.xml"]
+    with trilitenet.load(path) as predictor:
+        assert predictor.card.licence == "MIT"
+        assert predictor(np.zeros((90, 160, 3), np.uint8)).size == (90, 160)
+
+
+@pytest.mark.slow
+def test_nothing_is_written_beyond_the_tolerance(
+    artefacts: Artefacts, tmp_path: Path, frames: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(TOLERANCES, "fp32", Tolerance(pixels=1.1, boxes=1.1))
+    weights = str(artefacts.folder / "weights.safetensors")
+    with pytest.raises(BackendError, match="not written, it differs from the network"):
+        export(weights, size="64x128", output=tmp_path / "a.onnx", frames=frames)
+    assert not list(tmp_path.glob("*a.*"))
+
+
+@pytest.mark.slow
+def test_tensorrt_without_tensorrt_says_how(artefacts: Artefacts, tmp_path: Path, frames: Path) -> None:
+    weights = str(artefacts.folder / "weights.safetensors")
+    done = export(
+        weights, format="tensorrt", precision="fp16", size="64x128", output=tmp_path / "a.engine", frames=frames
+    )
+    assert done.path == tmp_path / "a.onnx"
+    assert "no engine was built" in done.summary()
+    assert "trtexec --onnx=" in done.summary()
+    assert trilitenet.load(done.path).backend.canvas == (64, 128)
+
+
+@pytest.mark.slow
+def test_torch_program(artefacts: Artefacts, tmp_path: Path, frames: Path) -> None:
+    weights = str(artefacts.folder / "weights.safetensors")
+    done = export(weights, format="torch", size="64x128", output=tmp_path / "a.pt2", frames=frames)
+    assert done.parity is not None
+    assert done.parity.failures == []
+    assert trilitenet.load(done.path).backend.name == "torch program cpu"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("format_", ["openvino", "onnx"])
+def test_int8(
+    artefacts: Artefacts, tmp_path: Path, frames: Path, format_: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if format_ == "openvino":
+        pytest.importorskip("nncf")
+    monkeypatch.setitem(TOLERANCES, "int8", Tolerance(pixels=0.5, boxes=0.0))
+    path = tmp_path / ("a.xml" if format_ == "openvino" else "a.onnx")
+    done = export(
+        str(artefacts.folder / "weights.safetensors"),
+        format=format_,  # type: ignore[arg-type]
+        precision="int8",
+        size="64x128",
+        calibration=frames,
+        output=path,
+    )
+    assert done.parity is not None
+    text = path.read_bytes()
+    assert (b"FakeQuantize" if format_ == "openvino" else b"QuantizeLinear") in text
+    assert "in floating point: difference, heads" in done.summary()

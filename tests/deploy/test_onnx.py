@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.artefacts import SIZE, Artefacts
+from tests.deploy.networks import lively_network
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, Thresholds
+from trilitenet.deploy.graph import DeployGraph
+from trilitenet.deploy.layouts import LAYOUTS, pick_layout
+from trilitenet.deploy.onnx import PORTABLE_OPERATORS, build_onnx, save_onnx
+from trilitenet.deploy.quantize import KEEP_STEPS, kept_nodes
+from trilitenet.deploy.tensorrt import trtexec_line
+from trilitenet.errors import ConfigError
+
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxscript")
+
+
+def test_a_program_that_is_not_ours_accepts_it(artefacts: Artefacts) -> None:
+    model = onnx.load(str(artefacts.folder / "model.onnx"))
+    onnx.checker.check_model(model, full_check=True)
+    assert [value.name for value in model.graph.output] == ["detection", "drivable", "lane"]
+    assert {entry.key for entry in model.metadata_props} == {CARD_KEY, ARTEFACT_KEY}
+    names = [node.name for node in model.graph.node]
+    assert len(set(names)) == len(names)
+    assert any(name.startswith("lane/up2/conv1/Conv") for name in names)
+    assert str(Path(__file__).parent) not in str(model)
+
+
+def test_suppression_inside_keeps_what_suppression_outside_keeps(tmp_path: Path) -> None:
+    from trilitenet.inference.onnx_backend import OnnxBackend
+    from trilitenet.inference.torch_backend import TorchBackend
+    from trilitenet.processing.letterbox import Letterbox
+    from trilitenet.processing.postprocess import to_perceptions
+
+    network = lively_network(classes=3, tasks=("detection",))
+    image = np.random.default_rng(0).integers(0, 256, (1, *SIZE, 3), np.uint8)
+    outside = TorchBackend(network, "cpu").run(image)
+    assert outside.detection is not None
+    scores = np.sort(outside.detection[0, :, 4] * outside.detection[0, :, 5:].max(1))
+    thresholds = Thresholds(confidence=float((scores[-100] + scores[-101]) / 2), iou=0.5)
+    info = ArtefactInfo("onnx", size=SIZE, nms=True)
+    save_onnx(build_onnx(DeployGraph(network), network.card, info, nms=thresholds), tmp_path / "a.onnx")
+    inside = OnnxBackend(tmp_path / "a.onnx").run(image)
+    assert inside.detection is not None
+    assert 1 < inside.detection.shape[1] < 200
+    boxes = []
+    for raw in (inside, outside):
+        found = to_perceptions(raw, [Letterbox.fit(SIZE, canvas=SIZE)], thresholds, network.card.class_names)[0].boxes
+        assert found is not None
+        boxes.append(found)
+    assert len(boxes[0]) == len(boxes[1])
+    assert np.abs(np.sort(boxes[0].confidence) - np.sort(boxes[1].confidence)).max() < 1e-4
+
+
+def test_portable_graphs_keep_to_their_operators() -> None:
+    network = lively_network()
+    info = ArtefactInfo("onnx", size=SIZE, input="float_nchw", masks="logit")
+    model = build_onnx(DeployGraph(network, LAYOUTS["planar"], masks="logit"), network.card, info)
+    assert {node.op_type for node in model.graph.node} <= PORTABLE_OPERATORS
+    inferred = onnx.shape_inference.infer_shapes(model)
+    ranks = [len(value.type.tensor_type.shape.dim) for value in inferred.graph.value_info]
+    assert max(ranks) <= 4
+
+
+@pytest.mark.slow
+def test_dynamic_sizes_and_half_weights(tmp_path: Path) -> None:
+    from trilitenet.inference.onnx_backend import OnnxBackend
+    from trilitenet.inference.torch_backend import TorchBackend
+
+    network = lively_network()
+    info = ArtefactInfo("onnx", "fp16", None)
+    model = build_onnx(DeployGraph(network, LAYOUTS["heads"]), network.card, info, half=True)
+    save_onnx(model, tmp_path / "a.onnx")
+    backend = OnnxBackend(tmp_path / "a.onnx")
+    assert backend.canvas is None
+    for size in ((64, 128), (96, 64)):
+        image = np.random.default_rng(0).integers(0, 256, (1, *size, 3), np.uint8)
+        got, wanted = backend.run(image), TorchBackend(network, "cpu").run(image)
+        assert got.lane is not None
+        assert wanted.lane is not None
+        assert np.mean((got.lane > 0) == (wanted.lane > 127)) > 0.99
+
+
+def test_layouts_are_picked() -> None:
+    assert pick_layout("auto", "tiny", "openvino", amx=True).front == 2
+    assert pick_layout("auto", "base", "openvino", amx=True).front == 1
+    assert pick_layout("auto", "base", "openvino", amx=False).half == 1
+    assert not pick_layout("auto", "tiny", "onnxruntime", amx=True).channels_last
+    with pytest.raises(ConfigError, match="did you mean 'pixels'"):
+        pick_layout("pixel", "tiny", "openvino", amx=False)
+
+
+def test_kept_nodes_follow_modules() -> None:
+    names = ["stem/Conv_1", "lane/out/Conv_2", "lane/up2/conv1/Conv_3", "detection/heads/0/Conv_4"]
+    assert kept_nodes(names, KEEP_STEPS[0]) == []
+    assert kept_nodes(names, KEEP_STEPS[1]) == ["detection/heads/0/Conv_4"]
+    assert set(kept_nodes(names, KEEP_STEPS[3])) == set(names)
+
+
+def test_trtexec_line() -> None:
+    line = trtexec_line(Path("a b.onnx"), Path("a.plan"), "fp16")
+    assert line == "trtexec '--onnx=a b.onnx' --saveEngine=a.plan --fp16 --useCudaGraph"

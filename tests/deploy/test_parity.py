@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from trilitenet.deploy.parity import Tolerance, compare
+from trilitenet.structures import RawOutputs
+
+STRICT = Tolerance(pixels=0.999, boxes=0.99)
+CANVAS = np.zeros((32, 64, 3), np.uint8)
+
+
+def outputs() -> RawOutputs:
+    lane = np.zeros((1, 32, 64), np.uint8)
+    lane[:, 10:20] = 200
+    row = [20, 15, 16, 10, 0.9, 0.9]
+    return RawOutputs(np.array([[row, [50, 15, 8, 8, 0.1, 0.5]]], np.float32), None, lane)
+
+
+def parity_of(changed: RawOutputs) -> list[str]:
+    return compare(lambda _: outputs(), lambda _: changed, [CANVAS], STRICT).failures
+
+
+def test_equal_outputs_pass() -> None:
+    assert parity_of(outputs()) == []
+
+
+def test_a_moved_box_fails_from_either_side() -> None:
+    moved = outputs()
+    assert moved.detection is not None
+    moved.detection[0, 0, 0] += 8
+    assert "boxes agree" in parity_of(moved)[0]
+    ghost = outputs()
+    assert ghost.detection is not None
+    ghost.detection[0, 1, 4:] = 0.9
+    assert "boxes agree" in parity_of(ghost)[0]
+
+
+def test_other_pixels_fail() -> None:
+    other = outputs()
+    assert other.lane is not None
+    other.lane[:, :2] = 255
+    assert "mask pixels agree" in parity_of(other)[0]
+
+
+def test_a_doubled_mask_is_compared() -> None:
+    raw = outputs()
+    assert raw.lane is not None
+    doubled = dataclasses.replace(raw, lane=raw.lane.repeat(2, 1).repeat(2, 2))
+    assert parity_of(doubled) == []
+    assert parity_of(dataclasses.replace(raw, lane=np.zeros((1, 64, 128), np.uint8))) != []

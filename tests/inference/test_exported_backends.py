@@ -1,0 +1,170 @@
+"""ONNX Runtime and OpenVINO on exported artefacts: parity, metadata, refusals, and no PyTorch."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import trilitenet
+from tests.artefacts import SIZE, Artefacts
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
+from trilitenet.errors import BackendError, ConfigError, ShapeError, WeightsError
+from trilitenet.inference.backend import Backend
+from trilitenet.inference.exported import prepare_input, read_metadata
+from trilitenet.inference.onnx_backend import OnnxBackend
+from trilitenet.inference.openvino_backend import OpenVINOBackend
+from trilitenet.inference.tensorrt_backend import pack_engine, unpack_engine
+from trilitenet.models.weights import load_network
+
+BACKENDS = [
+    pytest.param("model.onnx", OnnxBackend, {}, 0.9999, 0.01, id="onnxruntime"),
+    pytest.param("model.onnx", OpenVINOBackend, {}, 0.9999, 0.01, id="openvino-onnx"),
+    pytest.param("model.xml", OpenVINOBackend, {"precision": "fp32"}, 0.9999, 0.01, id="openvino-fp32"),
+    pytest.param("model.xml", OpenVINOBackend, {"streams": 2}, 0.97, 8.0, id="openvino-bf16-streams"),
+]
+
+
+@pytest.mark.parametrize(("name", "kind", "options", "pixels", "error"), BACKENDS)
+def test_equals_the_network(
+    artefacts: Artefacts, name: str, kind: Any, options: dict[str, Any], pixels: float, error: float
+) -> None:
+    import torch
+
+    from tests.deploy.test_graph import by_cell
+    from trilitenet.inference.torch_backend import TorchBackend
+
+    network = load_network(artefacts.folder / "weights.safetensors")
+    wanted = TorchBackend(network, "cpu").run(artefacts.images)
+    backend = kind(artefacts.folder / name, **options)
+    assert isinstance(backend, Backend)
+    assert backend.card == network.card
+    assert backend.canvas == SIZE
+    got = backend.run(artefacts.images)
+    assert wanted.detection is not None
+    assert got.detection is not None
+    reordered = by_cell(torch.from_numpy(wanted.detection), *SIZE).numpy()
+    assert np.abs(got.detection - reordered).max() < error
+    for task, threshold in (("drivable", 0.5), ("lane", 0.49)):
+        mask = getattr(got, task)
+        assert set(np.unique(mask)) <= {0, 255}
+        assert np.mean((mask > 0) == (getattr(wanted, task) > int(threshold * 255))) > pixels
+    backend.close()
+    backend.close()
+
+
+@pytest.mark.parametrize("kind", [OnnxBackend, OpenVINOBackend])
+def test_wrong_size_is_refused(artefacts: Artefacts, kind: Any) -> None:
+    backend = kind(artefacts.folder / "model.onnx")
+    with pytest.raises(ShapeError, match="128x64"):
+        backend.run(np.zeros((1, 96, 128, 3), np.uint8))
+    with pytest.raises(ShapeError, match="uint8"):
+        backend.run(np.zeros((1, 64, 128, 3), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("x.onnx", OnnxBackend), ("x.onnx", OpenVINOBackend), ("x.xml", OpenVINOBackend)]
+)
+def test_corrupt_and_missing_files_are_one_line(tmp_path: Path, name: str, kind: Any) -> None:
+    with pytest.raises(WeightsError, match="no such file"):
+        kind(tmp_path / name)
+    (tmp_path / name).write_bytes(b"not a model\n" * 20)
+    with pytest.raises(WeightsError, match="not a usable") as caught:
+        kind(tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", [OnnxBackend, OpenVINOBackend])
+def test_foreign_and_newer_artefacts_are_refused(artefacts: Artefacts, tmp_path: Path, kind: Any) -> None:
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load(str(artefacts.folder / "model.onnx"))
+    metadata = {entry.key: entry.value for entry in model.metadata_props}
+
+    def with_metadata(entries: dict[str, str]) -> Path:
+        del model.metadata_props[:]
+        onnx.helper.set_model_props(model, entries)
+        onnx.save(model, str(tmp_path / "other.onnx"))
+        return tmp_path / "other.onnx"
+
+    with pytest.raises(WeightsError, match=r"no 'trilitenet.card' in its metadata"):
+        kind(with_metadata({"author": "someone"}))
+    newer = json.dumps(json.loads(metadata[ARTEFACT_KEY]) | {"schema": 99})
+    with pytest.raises(WeightsError, match="schema 99 is newer"):
+        kind(with_metadata(metadata | {ARTEFACT_KEY: newer}))
+    newer = json.dumps(json.loads(metadata[CARD_KEY]) | {"schema": 99})
+    with pytest.raises(WeightsError, match="upgrade trilitenet"):
+        kind(with_metadata(metadata | {CARD_KEY: newer}))
+
+
+def test_openvino_without_its_weights_file(artefacts: Artefacts, tmp_path: Path) -> None:
+    shutil.copy(artefacts.folder / "model.xml", tmp_path / "model.xml")
+    with pytest.raises((WeightsError, BackendError)) as caught:
+        OpenVINOBackend(tmp_path / "model.xml")
+    assert "\n" not in str(caught.value)
+
+
+def test_bad_options(artefacts: Artefacts) -> None:
+    path = artefacts.folder / "model.xml"
+    with pytest.raises(BackendError, match="no device"):
+        OpenVINOBackend(path, "npu.9")
+    with pytest.raises(ConfigError, match="streams"):
+        OpenVINOBackend(path, streams=0)
+    with pytest.raises(ConfigError, match="precision"):
+        OpenVINOBackend(path, precision="fp8")
+    with pytest.raises(BackendError, match="cuda"):
+        OnnxBackend(artefacts.folder / "model.onnx", "mps")
+
+
+@pytest.mark.parametrize(("name", "runtime"), [("model.onnx", "onnxruntime"), ("model.xml", "openvino")])
+def test_prediction_needs_no_torch(artefacts: Artefacts, name: str, runtime: str) -> None:
+    code = (
+        "import sys, numpy, trilitenet\n"
+        f"predictor = trilitenet.load({str(artefacts.folder / name)!r}, backend={runtime!r})\n"
+        "perception = predictor(numpy.zeros((90, 160, 3), numpy.uint8))\n"
+        "assert perception.lane.shape == (90, 160)\n"
+        "assert predictor.class_names == ('class_0', 'class_1')\n"
+        "heavy = {'torch', 'onnx', 'nncf', 'matplotlib', 'av'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr
+
+
+def test_load_picks_a_runtime(artefacts: Artefacts) -> None:
+    onnx, xml = str(artefacts.folder / "model.onnx"), str(artefacts.folder / "model.xml")
+    assert trilitenet.load(onnx).backend.name.startswith("openvino cpu fp32")
+    assert trilitenet.load(onnx, backend="onnxruntime").backend.name == "onnxruntime cpu fp32"
+    assert trilitenet.load(xml).backend.name.startswith("openvino cpu")
+    with pytest.raises(ConfigError, match="runs on openvino, not on torch"):
+        trilitenet.load(xml, backend="torch")
+    with pytest.raises(ConfigError, match="trilitenet export"):
+        trilitenet.load(str(artefacts.folder / "weights.safetensors"), backend="openvino")
+
+
+def test_input_forms() -> None:
+    image = np.arange(2 * 4 * 3, dtype=np.uint8).reshape(2, 4, 3)
+    assert np.array_equal(prepare_input(image, ArtefactInfo("onnx", colour="bgr"))[0], image[:, :, ::-1])
+    planes = prepare_input(image, ArtefactInfo("onnx", input="float_nchw"))
+    assert planes.dtype == np.float32
+    assert np.array_equal(planes[0].transpose(1, 2, 0), image)
+
+
+def test_engine_files(tmp_path: Path) -> None:
+    card, info = ModelCard("tiny"), ArtefactInfo("tensorrt", "fp16", (384, 640))
+    path = tmp_path / "a.engine"
+    path.write_bytes(pack_engine(b"engine", card, info))
+    assert unpack_engine(path) == (card, info, b"engine")
+    path.write_bytes(b"ftrt" * 20)
+    with pytest.raises(WeightsError, match="not an engine of ours"):
+        unpack_engine(path)
+
+
+def test_metadata_that_is_no_json() -> None:
+    with pytest.raises(WeightsError, match="not JSON"):
+        read_metadata({CARD_KEY: ModelCard("tiny").to_json(), ARTEFACT_KEY: "{"}, "x.onnx")
