@@ -108,7 +108,8 @@ class SegmentationLoss(nn.Module):
                 f"got {tuple(logits.shape)} and {tuple(target.shape)}"
             )
         with torch.autocast(device_type=logits.device.type, enabled=False):
-            sums = _Sums.apply(logits, target, self.focal_alpha, self.focal_gamma)
+            sum_up: Any = _Sums.apply
+            sums: Tensor = sum_up(logits, target, self.focal_alpha, self.focal_gamma)
             focal_sum, hit, wrong, foreground, background = sums.unbind()
             focal = focal_sum / (foreground + background).clamp(min=1)
             # Two channels that sum to 1: what is wrong in one class is missed in the other.

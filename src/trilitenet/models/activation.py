@@ -14,6 +14,8 @@ from torch import Tensor, nn
 
 __all__ = ["PReLU", "batch_norm_prelu"]
 
+_jit: Any = torch.jit
+
 NARROW = 4
 """Up to so many channels, `batch_norm_prelu` normalises by rows too."""
 
@@ -24,7 +26,8 @@ class PReLU(nn.PReLU):
     def forward(self, x: Tensor) -> Tensor:
         """Apply the activation."""
         if _by_rows(x):
-            out: Tensor = _RowPReLU.apply(x, self.weight)
+            apply: Any = _RowPReLU.apply
+            out: Tensor = apply(x, self.weight)
             return out
         return super().forward(x)
 
@@ -34,9 +37,8 @@ def batch_norm_prelu(bn: nn.BatchNorm2d, act: nn.PReLU, x: Tensor) -> Tensor:
     if bn.training and x.shape[1] <= NARROW and _by_rows(x) and bn.num_batches_tracked is not None:
         bn.num_batches_tracked.add_(1)
         assert bn.momentum is not None
-        out: Tensor = _RowBatchNormPReLU.apply(
-            x, bn.weight, bn.bias, act.weight, bn.running_mean, bn.running_var, bn.momentum, bn.eps
-        )
+        apply: Any = _RowBatchNormPReLU.apply
+        out: Tensor = apply(x, bn.weight, bn.bias, act.weight, bn.running_mean, bn.running_var, bn.momentum, bn.eps)
         return out
     activated: Tensor = act(bn(x))
     return activated
@@ -48,7 +50,7 @@ def _by_rows(x: Tensor) -> bool:
         x.device.type == "cpu"
         and x.ndim == 4
         and torch.is_grad_enabled()
-        and not torch.jit.is_tracing()  # type: ignore[attr-defined]
+        and not _jit.is_tracing()
         and not torch.compiler.is_compiling()
         and x.is_contiguous(memory_format=torch.channels_last)
     )
