@@ -24,7 +24,8 @@ LEARNING_RATE = 0.012
 
 def _learn_by_heart(samples: list[Sample]) -> TriLiteNet:
     torch.manual_seed(0)
-    network = build_network("tiny").train().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network = build_network("tiny").train()
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     loss = MultiTaskLoss(
         DetectionLoss(network.anchors, 1),
         SegmentationLoss(0.5, 0.5),
