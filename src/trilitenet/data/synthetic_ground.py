@@ -92,7 +92,8 @@ class _Strip:
         share = self.d[:, part] - np.float32(limit)
         share *= self.inverse[:, part]
         share += np.float32(0.5)
-        return share.clip(0, 1, out=share)
+        np.clip(share, 0, 1, out=share)
+        return share
 
     def _band(self, low: float, high: float, part: slice = slice(None)) -> Plane:
         return self._above(low, part) - self._above(high, part)

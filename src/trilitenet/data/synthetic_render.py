@@ -127,7 +127,8 @@ def _draw_air(world: World, forward: Plane, left: Plane, up: Plane) -> NDArray[n
     if light.sun and abs(light.azimuth) < 0.9:
         glow = np.exp(-((aside - math.tan(light.azimuth)) ** 2 + (elevation - 0.38) ** 2) * 18)
         planes = [p + glow * (255 - p) for p in planes]
-    return np.clip(cv2.merge(planes), 0, 255).astype(np.uint8)
+    air: NDArray[np.uint8] = np.clip(cv2.merge(planes), 0, 255).astype(np.uint8)
+    return air
 
 
 def _draw_skyline(world: World, image: NDArray[np.uint8], slope: Plane, azimuth: Plane, lighting: Lighting) -> None:

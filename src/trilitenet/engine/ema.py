@@ -54,7 +54,8 @@ class MovingAverage:
 
 def _tensors(network: nn.Module) -> tuple[list[Tensor], list[Tensor]]:
     """Return the floating-point tensors, to average, and the others (counters), to copy."""
-    averaged, copied = [], []
+    averaged: list[Tensor] = []
+    copied: list[Tensor] = []
     for tensor in (*network.parameters(), *network.buffers()):
         (averaged if tensor.is_floating_point() else copied).append(tensor.detach())
     return averaged, copied
