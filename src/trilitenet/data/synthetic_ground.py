@@ -89,7 +89,7 @@ class _Strip:
 
     def _above(self, limit: float, part: slice = slice(None)) -> Plane:
         """Return the share of each pixel that lies left of d = limit."""
-        share = self.d[:, part] - np.float32(limit)
+        share: Plane = self.d[:, part] - np.float32(limit)
         share *= self.inverse[:, part]
         share += np.float32(0.5)
         np.clip(share, 0, 1, out=share)
