@@ -15,7 +15,7 @@ __all__ = ["serve"]
 
 def serve(
     *,
-    model: str = "small",
+    model: str = "tiny",
     host: str = "127.0.0.1",
     port: int = 8000,
     device: str = "auto",
@@ -87,8 +87,7 @@ def serve(
     cv2.setNumThreads(1)  # images are the unit of parallel work here
     # The network's thread takes Python's lock often and briefly; with the usual 5 ms each other thread delays it.
     sys.setswitchinterval(0.0005)
-    predictor = load(model, device=device, backend=backend, confidence=confidence, streams=streams)
-    with predictor:
+    with listener, load(model, device=device, backend=backend, confidence=confidence, streams=streams) as predictor:
         if not max_batch:
             settings = dataclasses.replace(
                 settings, max_batch=getattr(predictor.backend, "streams", settings.max_batch)
@@ -98,12 +97,14 @@ def serve(
 
 def _listen(host: str, port: int) -> socket.socket:
     """Return a listening socket: a port that is taken is told before the model is loaded."""
+    if not 0 <= port <= 65535:  # create_server would leave its socket open
+        raise ConfigError(f"cannot listen on {host} port {port} (port must be 0 to 65535); choose with --port")
     try:
         return socket.create_server(
             (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET, backlog=1024
         )
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
+    except OSError as error:
+        reason = error.strerror or error
         raise ConfigError(f"cannot listen on {host} port {port} ({reason}); choose with --host and --port") from error
 
 
