@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from trilitenet.commands.benchmark import benchmark as benchmark
+    from trilitenet.commands.export import export as export
     from trilitenet.commands.load import load as load
     from trilitenet.commands.train import train as train
     from trilitenet.inference.predictor import Predictor as Predictor
@@ -29,13 +31,26 @@ _PUBLIC = {
     "Boxes": "trilitenet.structures",
     "Perception": "trilitenet.structures",
     "Predictor": "trilitenet.inference.predictor",
+    "benchmark": "trilitenet.commands.benchmark",
     "build_network": "trilitenet.models.trilitenet",
+    "export": "trilitenet.commands.export",
     "load": "trilitenet.commands.load",
     "load_network": "trilitenet.models.weights",
     "train": "trilitenet.commands.train",
 }
 
-__all__ = ["Boxes", "Perception", "Predictor", "__version__", "build_network", "load", "load_network", "train"]
+__all__ = [
+    "Boxes",
+    "Perception",
+    "Predictor",
+    "__version__",
+    "benchmark",
+    "build_network",
+    "export",
+    "load",
+    "load_network",
+    "train",
+]
 
 
 def __getattr__(name: str) -> Any:
