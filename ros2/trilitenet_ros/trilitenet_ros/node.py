@@ -39,7 +39,7 @@ class PerceptionNode(Node):
         self._vehicle_frame = self.declare_parameter("vehicle_frame", "base_link").value
         self._publish_masks = self.declare_parameter("publish_masks", True).value
         self._predictor = trilitenet.load(
-            self.declare_parameter("model", "small").value,
+            self.declare_parameter("model", "tiny").value,
             device=self.declare_parameter("device", "auto").value,
             backend=self.declare_parameter("backend", "auto").value,
             confidence=None if confidence < 0 else confidence,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import socket
@@ -24,6 +25,9 @@ logger = logging.getLogger("trilitenet.server")
 
 _MAX_HEADERS: Final = 32 * 1024
 """Bytes of a request's first line and headers."""
+
+_LAST_CALL: Final = 1.0
+"""Seconds that a connection without a request is given when the server stops."""
 
 _TCP_USER_TIMEOUT: Final = getattr(socket, "TCP_USER_TIMEOUT", None)
 
@@ -100,6 +104,14 @@ class GuardedProtocol(HttpToolsProtocol):
         self._header_bytes = 0
         super().on_message_complete()
 
+    def shutdown(self) -> None:
+        """The server stops: a client that has just connected is about to ask, so it gets a moment to do so."""
+        if self.cycle is None and not self.transport.is_closing():
+            self._cancel()
+            self._due = self.loop.call_later(_LAST_CALL, self.transport.close)
+        else:
+            super().shutdown()
+
     def pause_writing(self) -> None:
         """The client does not read: it has so long to do so."""
         super().pause_writing()
@@ -159,7 +171,31 @@ class GuardedServer(uvicorn.Server):
         until = time.monotonic() + service.settings.drain
         while time.monotonic() < until and not self.force_exit:
             await asyncio.sleep(0.05)
+        # Closing a listener resets connections that nobody has accepted yet; a second handle keeps it open till then.
+        spares = [listener.dup() for listener in sockets or []]
+        for server in self.servers:
+            server.close()
+        for spare in spares:
+            await self._accept_waiting(spare)
         await super().shutdown(sockets)
+
+    async def _accept_waiting(self, listener: socket.socket) -> None:
+        """Accept what waits at a listener, then close it."""
+
+        def protocol() -> asyncio.Protocol:
+            made: asyncio.Protocol = self.config.http_protocol_class(  # type: ignore[call-arg]
+                config=self.config, server_state=self.server_state, app_state=self.lifespan.state
+            )
+            return made
+
+        accepted = []
+        with listener:
+            listener.setblocking(False)
+            with contextlib.suppress(OSError):  # BlockingIOError when none is left
+                while True:
+                    accepted.append(listener.accept()[0])
+        for connection in accepted:
+            await asyncio.get_running_loop().connect_accepted_socket(protocol, connection)
 
 
 def build_server(application: Application) -> GuardedServer:
