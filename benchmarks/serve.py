@@ -1,7 +1,7 @@
 """Load the HTTP service from a second process on loopback, and compare with the predictor called in-process.
 
-    python benchmarks/serve.py throughput --model small
-    python benchmarks/serve.py overload --model small --seconds 300
+    python benchmarks/serve.py throughput --model tiny
+    python benchmarks/serve.py overload --model tiny --seconds 300
 
 ``throughput`` alternates, several times, the predictor in-process at its best batch size and the service with 1, 8 and
 32 clients that wait for each answer. ``overload`` sends at twice the capacity whether answers come or not, and
@@ -245,7 +245,7 @@ def overload(arguments: argparse.Namespace) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["throughput", "overload"])
-    parser.add_argument("--model", default="small")
+    parser.add_argument("--model", default="tiny")
     parser.add_argument("--backend", default="auto")
     parser.add_argument("--streams", type=int, default=1)
     parser.add_argument("--max-batch", type=int, default=0)
