@@ -62,7 +62,8 @@ def test_the_page_is_self_contained_and_escaped(report: Report, tmp_path: Path) 
         assert len(re.findall(f"<{tag}[ >]", text)) == text.count(f"</{tag}>"), tag
 
 
-def test_the_terminal_form_names_every_figure(report: Report) -> None:
+def test_the_terminal_form_names_every_figure(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
     text = report.summary()
     assert "fair protocol" in text
     assert "paper protocol" in text
@@ -70,7 +71,7 @@ def test_the_terminal_form_names_every_figure(report: Report) -> None:
     assert f"{percent(report.figures['fair/drivable/miou'].value)} " in text
     assert re.search(r"night +10 +\(", text)  # few images stand in brackets
     assert "\x1b" not in text  # no colours into a pipe
-    assert max(map(len, text.splitlines())) <= 120
+    assert max(map(len, text.splitlines())) <= 100
 
 
 def test_what_is_no_report_is_refused(tmp_path: Path, report: Report) -> None:
