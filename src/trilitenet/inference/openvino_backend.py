@@ -56,6 +56,11 @@ class OpenVINOBackend:
             raise WeightsError(f"{path}: no such file")
         if streams < 1:
             raise ConfigError(f"streams must be at least 1, got {streams}")
+        with path.open("rb") as file:
+            start = file.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
+        # Checked here because OpenVINO tries every reader it has on a foreign file, and some of them talk.
+        if not start.startswith(b"\x08" if path.suffix.lower() == ".onnx" else b"<"):
+            raise WeightsError(f"{path}: not a usable OpenVINO or ONNX model (it does not begin as one)")
         core = openvino.Core()
         try:
             model = core.read_model(path)
