@@ -35,6 +35,7 @@ async function shrink(source, width, height, longest, quality) {
 
 function once(target, event, signal) {
   return new Promise((resolve, reject) => {
+    signal?.throwIfAborted(); // a signal that has gone off already tells nobody again
     target.addEventListener(event, resolve, { once: true, signal });
     target.addEventListener("error", () => reject(new Error("This clip cannot be played here.")), { once: true, signal });
     signal?.addEventListener("abort", () => reject(new DOMException("stopped", "AbortError")), { once: true });
