@@ -65,7 +65,9 @@ def _pooled_iou(predicted: list[np.ndarray], truth: list[np.ndarray]) -> float:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_tiny_learns_eight_scenes_by_heart() -> None:
-    samples = list(itertools.islice(filter(_resolvable, SyntheticScenes(0, size=SIZE)), 8))
+    scenes = SyntheticScenes(0, size=SIZE)
+    drawn = (scenes[index] for index in itertools.count())
+    samples = list(itertools.islice((sample for sample in drawn if _resolvable(sample)), 8))
     network = _learn_by_heart(samples)
     predictor = Predictor(TorchBackend(network, "cpu"), long_side=SIZE[1])
     seen = predictor([sample.image for sample in samples])
