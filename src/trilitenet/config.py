@@ -205,22 +205,7 @@ class ModelCard:
         Raises:
             WeightsError: If it is not a card, or of a newer layout.
         """
-        try:
-            mapping = json.loads(text)
-        except json.JSONDecodeError as error:
-            raise WeightsError(f"{source}: its card is not JSON ({error})") from error
-        if not isinstance(mapping, dict):
-            raise WeightsError(f"{source}: its card is not a JSON object")
-        schema = mapping.get("schema")
-        if not isinstance(schema, int) or schema > CARD_SCHEMA:
-            raise WeightsError(
-                f"{source}: card schema {schema!r} is newer than {CARD_SCHEMA}, which this version reads; "
-                "upgrade trilitenet"
-            )
-        try:
-            return parse(cls, mapping, source)
-        except ConfigError as error:
-            raise WeightsError(str(error)) from error
+        return _read_versioned(cls, text, source, ("card", "card"), CARD_SCHEMA)
 
 
 CARD_KEY: Final = "trilitenet.card"
@@ -274,20 +259,7 @@ class ArtefactInfo:
         Raises:
             WeightsError: If it is not one, or of a newer layout.
         """
-        try:
-            mapping = json.loads(text)
-        except json.JSONDecodeError as error:
-            raise WeightsError(f"{source}: its description is not JSON ({error})") from error
-        schema = mapping.get("schema") if isinstance(mapping, dict) else None
-        if not isinstance(schema, int) or schema > ARTEFACT_SCHEMA:
-            raise WeightsError(
-                f"{source}: artefact schema {schema!r} is newer than {ARTEFACT_SCHEMA}, which this version reads; "
-                "upgrade trilitenet"
-            )
-        try:
-            return parse(cls, mapping, source)
-        except ConfigError as error:
-            raise WeightsError(str(error)) from error
+        return _read_versioned(cls, text, source, ("description", "artefact"), ARTEFACT_SCHEMA)
 
 
 _T = TypeVar("_T")
@@ -308,6 +280,38 @@ def parse(cls: type[_T], mapping: Mapping[str, Any], source: str) -> _T:
         return _adapter(cls).validate_python(dict(mapping))
     except ValidationError as error:
         raise ConfigError(f"{source}: {_explain(cls, error)}") from error
+
+
+def _read_versioned(cls: type[_T], text: str, source: str, names: tuple[str, str], newest: int) -> _T:
+    """Read the JSON of a dataclass with a ``schema`` number, refusing a newer layout.
+
+    Args:
+        cls: The dataclass.
+        text: Its JSON.
+        source: The file it came from, for messages.
+        names: What messages call the JSON, and its schema.
+        newest: The highest schema this version reads.
+
+    Raises:
+        WeightsError: If it is not such JSON, or of a newer layout.
+    """
+    what, schema_name = names
+    try:
+        mapping = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise WeightsError(f"{source}: its {what} is not JSON ({error})") from error
+    if not isinstance(mapping, dict):
+        raise WeightsError(f"{source}: its {what} is not a JSON object")
+    schema = mapping.get("schema")
+    if not isinstance(schema, int) or schema > newest:
+        raise WeightsError(
+            f"{source}: {schema_name} schema {schema!r} is newer than {newest}, which this version reads; "
+            "upgrade trilitenet"
+        )
+    try:
+        return parse(cls, mapping, source)
+    except ConfigError as error:
+        raise WeightsError(str(error)) from error
 
 
 def _adapter(cls: type[_T]) -> TypeAdapter[_T]:
