@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -17,14 +19,18 @@ import yaml
 import trilitenet
 from trilitenet.commands.train import train
 from trilitenet.commands.train_table import train_table
+from trilitenet.config import TASKS
+from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.synthetic_files import write_dataset
 from trilitenet.engine import train as engine
 from trilitenet.engine.checkpoint import read_checkpoint
 from trilitenet.engine.loggers import CsvLogger, read_csv
+from trilitenet.engine.predictions import PredictionWriter
 from trilitenet.engine.recipe import read_recipe
 from trilitenet.errors import ConfigError, OutputError, TrainingError, WeightsError
 from trilitenet.models.trilitenet import TriLiteNet
 from trilitenet.models.weights import load_network, read_card
+from trilitenet.structures import Boxes, Perception
 
 pytest.importorskip("lightning_fabric")
 
@@ -83,6 +89,7 @@ def same(first: Any, second: Any, path: str = "") -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")  # two workers on a machine of one core
 def test_resume_is_bit_for_bit(scenes: Path, tmp_path: Path) -> None:
     options = {"workers": 2, "multi_scale": (0.8, 1.6), "precision": "bf16-mixed", "balancing": "uncertainty"}
     train(**settings(scenes, tmp_path / "straight", max_steps=20, **options))
@@ -147,10 +154,7 @@ def test_the_best_is_never_replaced_by_a_worse_one(
 ) -> None:
     values = iter([0.5, 0.7, 0.6, 0.8])
 
-    def validation(*_: Any) -> Any:
-        return lambda network: {"drivable/miou": next(values)}
-
-    monkeypatch.setattr("trilitenet.commands.train._validation", validation)
+    monkeypatch.setattr("trilitenet.commands.train.validation_figures", lambda *_: {"drivable/miou": next(values)})
     options = settings(scenes, tmp_path, val_split="val", tasks=("drivable",), pictures=0)
     train(**options, max_steps=4)
     (tmp_path / "last.ckpt").rename(tmp_path / "kept")
@@ -161,7 +165,7 @@ def test_the_best_is_never_replaced_by_a_worse_one(
 
 
 def test_stops_early(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("trilitenet.commands.train._validation", lambda *_: lambda network: {"drivable/miou": 0.5})
+    monkeypatch.setattr("trilitenet.commands.train.validation_figures", lambda *_: {"drivable/miou": 0.5})
     options = settings(scenes, tmp_path, val_split="val", tasks=("drivable",), patience=2, pictures=0)
     result = train(**options)
     assert result.finished
@@ -178,6 +182,48 @@ def test_transfer_freeze_and_distil(scenes: Path, tmp_path: Path, capsys: pytest
     for name, tensor in ours.encoder.state_dict().items():
         torch.testing.assert_close(tensor, theirs.encoder.state_dict()[name], rtol=0, atol=1e-6)
     assert read_card(second.weights).provenance["teacher"] == "final.safetensors"
+
+
+def test_distils_from_saved_outputs(scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    images = tmp_path / "images-alone"
+    shutil.copytree(scenes / "images", images / "images")
+    dataset = DrivingDataset(scenes, "train")
+    assert len(dataset) == 10
+    teacher = tmp_path / "outputs"
+    with PredictionWriter(teacher, TASKS) as writer:
+        for sample in dataset:
+            assert sample.boxes is not None
+            assert sample.class_id is not None
+            assert sample.drivable is not None
+            assert sample.lane is not None
+            said = Boxes(sample.boxes, np.full(len(sample.boxes), 0.9, np.float32), sample.class_id)
+            drivable, lane = sample.drivable.astype(bool), sample.lane.astype(bool)
+            writer.write(
+                sample.name,
+                Perception(size=sample.size, class_names=("vehicle",), boxes=said, drivable=drivable, lane=lane),
+            )
+    plain = settings(scenes, tmp_path / "labels", max_steps=2)
+    train(**plain)
+    taught = {**plain, "data": str(images), "output": str(tmp_path / "taught"), "teacher": str(teacher)}
+    result = train(**taught)
+    assert "taught detection, drivable, lane on 10 of 10 images" in capsys.readouterr().err
+    assert read_card(result.weights).provenance["teacher"] == "outputs"
+    curves = [
+        [row[2] for row in read_csv(tmp_path / name / "metrics.csv") if re.search("box|drivable|lane", row[1])]
+        for name in ("labels", "taught")  # whose ignored boxes differ, and objectness with them
+    ]
+    assert len(curves[0]) == 10
+    assert curves[0] == pytest.approx(curves[1], rel=1e-3)
+    shutil.rmtree(teacher / "lane")
+    with pytest.raises(ConfigError, match="the teacher has none of the tasks lane"):
+        train(overwrite=True, **taught, tasks=("lane",))
+    (teacher / "detections.json").unlink()
+    for path in (teacher / "drivable").iterdir():
+        path.rename(path.with_name(f"other-{path.name}"))
+    with pytest.raises(ConfigError, match="none of the 10 training images"):
+        train(overwrite=True, **taught)
+    with pytest.raises(ConfigError, match="the lower first"):
+        train(overwrite=True, **taught, teacher_confidence=(0.6, 0.5))
 
 
 def test_not_finite_steps_are_left_out_and_end_the_run(

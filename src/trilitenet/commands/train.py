@@ -6,7 +6,7 @@ import dataclasses
 import inspect
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, get_type_hints
 
@@ -20,12 +20,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from trilitenet.config import DEFAULT_ANCHORS, ModelCard
 from trilitenet.data.loader import build_loader
-from trilitenet.data.prepared import open_dataset
+from trilitenet.data.prepared import PreparedDataset, open_dataset
 from trilitenet.data.reading import DrivingDataset, MixedDataset, SampleSource, sampling_weights
 from trilitenet.data.sample import Sample
-from trilitenet.data.transforms import TrainTransform
+from trilitenet.data.transforms import TrainTransform, Transform
 from trilitenet.engine.anchors import box_sizes, fit_anchors
 from trilitenet.engine.evaluate import evaluate
+from trilitenet.engine.lessons import Lessons, TaughtTransform
 from trilitenet.engine.loggers import build_loggers
 from trilitenet.engine.recipe import TrainConfig, merge, read_recipe
 from trilitenet.engine.results import write_results
@@ -43,7 +44,7 @@ from trilitenet.models.trilitenet import TriLiteNet, build_network
 from trilitenet.models.weights import load_network
 from trilitenet.structures import Boxes, Perception
 
-__all__ = ["build_loss", "train"]
+__all__ = ["build_loss", "train", "validation_figures"]
 
 _YAML_FLAGS: Final = ("anchors", "sampling", "extra_data")
 """Fields whose flag takes YAML, for example --sampling '{timeofday: {night: 2}}'."""
@@ -76,7 +77,7 @@ def train(
         dataset = _training_data(config)
         loader = build_loader(
             dataset,
-            TrainTransform(config.input_size, config.augmentation),
+            _transform(config, dataset, display),
             batch_size=config.batch_size // config.accumulate,
             seed=config.seed,
             weights=sampling_weights(dataset, config.sampling) if config.sampling else None,
@@ -98,7 +99,7 @@ def train(
             loader,
             fabric,
             network.card,
-            validate=None if validation is None else _validation(validation, device),
+            validate=None if validation is None else lambda network: validation_figures(network, validation, device),
             teacher=_teacher(config, network),
             display=display,
         )
@@ -129,6 +130,28 @@ def _training_data(config: TrainConfig) -> SampleSource:
         for root, weight in config.extra_data.items()
     ]
     return MixedDataset([(first, 1.0), *more])
+
+
+def _transform(config: TrainConfig, dataset: SampleSource, display: _Display) -> Transform:
+    """Build the training transform, with a teacher's saved outputs as targets if there is a folder of them."""
+    plain = TrainTransform(config.input_size, config.augmentation)
+    if config.teacher is None or not Path(config.teacher).is_dir():
+        return plain
+    parts = [part for part, _ in dataset.parts] if isinstance(dataset, MixedDataset) else [dataset]
+    lessons = Lessons(
+        Path(config.teacher),
+        dataset.class_names,
+        config.teacher_confidence,
+        resized=any(isinstance(part, PreparedDataset) for part in parts),
+    )
+    if not set(lessons.tasks) & set(config.tasks):
+        raise ConfigError(f"{config.teacher}: the teacher has none of the tasks {', '.join(config.tasks)}")
+    names = {name for part in parts for name in getattr(part, "names", ())}
+    taught = len(names & lessons.names())
+    if not taught:
+        raise ConfigError(f"{config.teacher}: none of the {len(names)} training images is among the saved outputs")
+    display.line(f"{config.teacher}: taught {', '.join(lessons.tasks)} on {taught} of {len(names)} images")
+    return TaughtTransform(plain, lessons, config.distillation)
 
 
 def _network(config: TrainConfig, dataset: SampleSource, display: _Display, *, resume: bool) -> TriLiteNet:
@@ -193,7 +216,7 @@ def build_loss(config: TrainConfig, network: TriLiteNet) -> MultiTaskLoss:
 
 
 def _teacher(config: TrainConfig, network: TriLiteNet) -> tuple[TriLiteNet, DistillationLoss] | None:
-    if config.teacher is None:
+    if config.teacher is None or Path(config.teacher).is_dir():
         return None
     teacher = load_network(config.teacher)
     if not set(teacher.tasks) & set(network.tasks):
@@ -201,28 +224,24 @@ def _teacher(config: TrainConfig, network: TriLiteNet) -> tuple[TriLiteNet, Dist
     return teacher, DistillationLoss(network.anchors, teacher.anchors, config.distillation)
 
 
-def _validation(dataset: DrivingDataset, device: str) -> Callable[[TriLiteNet], Mapping[str, float]]:
-    """Return a function that scores a network by the evaluation command's own code (the 'fair' protocol)."""
-
-    def validate(network: TriLiteNet) -> dict[str, float]:
-        predictor = Predictor(TorchBackend(network, device))
-        scores = evaluate(predictor, dataset, batch_size=8, resamples=0, worst=0).fair
-        figures: dict[str, float] = {}
-        if scores is None:
-            return figures
-        if scores.detection is not None:
-            figures |= {"detection/recall": scores.detection.recall_all, "detection/ap50": scores.detection.ap50}
-        if scores.drivable is not None:
-            figures |= {"drivable/miou": scores.drivable.miou}
-        if scores.lane is not None:
-            figures |= {
-                "lane/accuracy": scores.lane.as_labelled.balanced_accuracy,
-                "lane/iou": scores.lane.as_labelled.iou,
-                "lane/f1_2px": scores.lane.f1,
-            }
+def validation_figures(network: TriLiteNet, dataset: DrivingDataset, device: str) -> dict[str, float]:
+    """Score a network by the evaluation command's own code (the 'fair' protocol); return its figures by name."""
+    predictor = Predictor(TorchBackend(network, device))
+    scores = evaluate(predictor, dataset, batch_size=8, resamples=0, worst=0).fair
+    figures: dict[str, float] = {}
+    if scores is None:
         return figures
-
-    return validate
+    if scores.detection is not None:
+        figures |= {"detection/recall": scores.detection.recall_all, "detection/ap50": scores.detection.ap50}
+    if scores.drivable is not None:
+        figures |= {"drivable/miou": scores.drivable.miou}
+    if scores.lane is not None:
+        figures |= {
+            "lane/accuracy": scores.lane.as_labelled.balanced_accuracy,
+            "lane/iou": scores.lane.as_labelled.iou,
+            "lane/f1_2px": scores.lane.f1,
+        }
+    return figures
 
 
 def _pictures(

@@ -43,8 +43,11 @@ class TrainConfig:
             with width and height swapped).
         init: Weight file to start from (or a shipped name); what fits by name and shape is taken over.
         freeze: Parts that stay as they are, for example encoder, or encoder.level1.
-        teacher: Weight file of a network to distil from, of any variant, with the same classes.
+        teacher: Weight file of a network to distil from, of any variant, with the same classes; or a folder of any
+            model's saved outputs on the training images, as `trilitenet evaluate --save` writes them.
         distillation: Weights of distillation's detection, drivable and lane terms.
+        teacher_confidence: Of a folder's boxes, those scored at least the second number are objects, those between the
+            two are ignored regions.
         epochs: Passes over the data (Section IV-A: 200).
         batch_size: Images an optimiser step (Section IV-A: 16), over all processes.
         accumulate: Forward and backward passes an optimiser step; each takes batch_size / accumulate images.
@@ -106,6 +109,7 @@ class TrainConfig:
     freeze: tuple[str, ...] = ()
     teacher: str | None = None
     distillation: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    teacher_confidence: tuple[float, float] = (0.1, 0.5)
     epochs: int = 200
     batch_size: int = 16
     accumulate: int = 1
@@ -166,6 +170,12 @@ class TrainConfig:
             raise ConfigError(f"batch_size {self.batch_size} is not a multiple of accumulate {self.accumulate}")
         if self.multi_scale is not None and not 0 < self.multi_scale[0] <= self.multi_scale[1]:
             raise ConfigError(f"multi_scale must be two factors, the lower first, got {self.multi_scale}")
+        if not all(weight >= 0 for weight in self.distillation):
+            raise ConfigError(f"distillation's weights must not be negative, got {self.distillation}")
+        if not 0 <= self.teacher_confidence[0] <= self.teacher_confidence[1] <= 1:
+            raise ConfigError(
+                f"teacher_confidence must be two numbers in [0, 1], the lower first, got {self.teacher_confidence}"
+            )
         if not self.lr > 0:
             raise ConfigError(f"lr must be above 0, got {self.lr}")
         if not 0 <= self.ema_decay < 1:

@@ -1,0 +1,187 @@
+"""Distillation from a teacher's saved outputs: its masks and boxes as targets, moved along with the image.
+
+The teacher may be any model, for all that is read of it is a folder in the form of `trilitenet.engine.predictions`. Its
+outputs replace labels before a sample is transformed, so they pass through the very same affine map, flip, mosaic and
+crop as the image does.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from trilitenet.config import TASKS, Task
+from trilitenet.data.sample import Sample
+from trilitenet.data.transforms import Transform
+from trilitenet.engine.predictions import SavedPredictions
+from trilitenet.errors import ConfigError, DataError
+from trilitenet.structures import Perception
+
+__all__ = ["Lessons", "TaughtTransform"]
+
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
+_HALF: Final = 127
+"""An area-resized mask pixel (0 to 255) above this is foreground, which keeps a mask's area."""
+
+
+class Lessons:
+    """What a teacher said of the images, as labels.
+
+    Args:
+        folder: Saved outputs, as `trilitenet evaluate --save` writes them.
+        class_names: Detection classes of the data set, in the teacher's order of categories.
+        confidence: (low, high): a box scored at least ``high`` is an object, one between is an ignored region, one
+            below ``low`` is left out.
+        resized: Whether samples may be smaller than the images that the teacher saw, as prepared ones are.
+
+    Raises:
+        ConfigError: If samples are resized and no mask tells from what size.
+        DataError: If there is nothing in the folder, or it has another form.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        class_names: Sequence[str],
+        confidence: tuple[float, float] = (0.1, 0.5),
+        *,
+        resized: bool = False,
+    ) -> None:
+        self._saved = SavedPredictions(folder, class_names)
+        self._low, self._high = confidence
+        if resized and self._saved.tasks == ("detection",):
+            raise ConfigError(
+                f"{folder}: boxes without masks do not tell the size of the images they are for, and the data is "
+                "prepared at another; give the data set itself as --data"
+            )
+
+    @property
+    def tasks(self) -> tuple[Task, ...]:
+        """The tasks that the teacher has."""
+        return self._saved.tasks
+
+    def names(self) -> set[str]:
+        """Return the images that the teacher said something of."""
+        masks = (path.stem for task in ("drivable", "lane") for path in (self._saved.folder / task).glob("*.png"))
+        return self._saved.names | set(masks)
+
+    def of(self, sample: Sample) -> Sample | None:
+        """Return the sample with the teacher's outputs as its only labels; None if the teacher never saw it.
+
+        Raises:
+            DataError: If a mask is missing beside another, broken, or of another shape than the image.
+        """
+        masks = [task for task in self.tasks if task != "detection"]
+        seen = [path for task in masks if (path := self._saved.folder / task / f"{sample.name}.png").is_file()]
+        if not seen and (masks or sample.name not in self._saved.names):
+            return None
+        size = _png_size(seen[0]) if seen else sample.size
+        # A prepared image's sides are rounded to whole pixels.
+        if abs(size[0] / size[1] * sample.size[1] / sample.size[0] - 1) > 0.02:
+            raise DataError(
+                f"{seen[0]}: {size[1]}x{size[0]}, of another shape than the image of {sample.size[1]}x{sample.size[0]}"
+            )
+        said = self._saved.get(sample.name, size)
+        boxes, class_id, doubtful = self._boxes(said, (sample.size[0] / size[0], sample.size[1] / size[1]))
+        return dataclasses.replace(
+            sample,
+            boxes=boxes,
+            class_id=class_id,
+            ignored=doubtful,
+            drivable=_resized(said.drivable, sample.size),
+            lane=_resized(said.lane, sample.size),
+        )
+
+    def _boxes(
+        self, said: Perception, scale: tuple[float, float]
+    ) -> tuple[NDArray[np.float32] | None, NDArray[np.int64] | None, NDArray[np.float32]]:
+        """Return the boxes taken for objects, their classes, and the boxes to ignore."""
+        if said.boxes is None:
+            return None, None, np.zeros((0, 4), np.float32)
+        xyxy = (said.boxes.xyxy * np.array([scale[1], scale[0]] * 2)).astype(np.float32)
+        sure = said.boxes.confidence >= self._high
+        doubtful = ~sure & (said.boxes.confidence >= self._low)
+        return xyxy[sure], said.boxes.class_id[sure], xyxy[doubtful]
+
+
+@dataclasses.dataclass(frozen=True)
+class TaughtTransform:
+    """A transform of samples whose labels are, in part, the teacher's.
+
+    A task without a label gets the teacher's. A task with one keeps it or gets the teacher's, by a draw a sample and
+    task: with weight w, the teacher's share is w / (1 + w), so that the loss is on average that by the label plus w
+    times that by the teacher, over 1 + w.
+
+    Attributes:
+        inner: The transform proper.
+        lessons: The teacher's outputs.
+        weights: w of detection, drivable and lane; 0 leaves a task to its labels.
+    """
+
+    inner: Transform
+    lessons: Lessons
+    weights: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    def __call__(
+        self, sample: Sample, rng: np.random.Generator, draw: Callable[[np.random.Generator], Sample] | None = None
+    ) -> Sample:
+        """Return the transformed sample; its labels are chosen first."""
+        # An own stream, so that images are augmented as they are without a teacher.
+        choice = rng.spawn(1)[0]
+        other: Callable[[np.random.Generator], Sample] | None = None
+        if draw is not None:
+
+            def other(rng: np.random.Generator) -> Sample:
+                return self._taught(draw(rng), choice)
+
+        return self.inner(self._taught(sample, choice), rng, other)
+
+    def _taught(self, sample: Sample, rng: np.random.Generator) -> Sample:
+        draws = rng.random(len(TASKS))
+        lesson = self.lessons.of(sample)
+        if lesson is None:
+            return sample
+        taken: dict[str, Any] = {}
+        for task, weight, drawn in zip(TASKS, self.weights, draws, strict=True):
+            fields = ("boxes", "class_id") if task == "detection" else (task,)
+            labelled = getattr(sample, fields[0]) is not None
+            if task not in self.lessons.tasks or not weight or (labelled and drawn >= weight / (1 + weight)):
+                continue
+            taken |= {name: getattr(lesson, name) for name in fields}
+            if task == "detection":
+                taken["ignored"] = np.concatenate([sample.ignored, lesson.ignored])
+        return dataclasses.replace(sample, **taken)
+
+
+def _png_size(path: Path) -> tuple[int, int]:
+    """Return (height, width) from a PNG's header.
+
+    Raises:
+        DataError: If it is none.
+    """
+    with path.open("rb") as file:
+        header = file.read(24)
+    if len(header) < 24 or not header.startswith(_PNG):
+        raise DataError(f"{path}: not a PNG image")
+    width, height = struct.unpack(">II", header[16:])
+    if not width or not height:
+        raise DataError(f"{path}: not a PNG image")
+    return height, width
+
+
+def _resized(mask: NDArray[np.bool_] | None, size: tuple[int, int]) -> NDArray[np.uint8] | None:
+    """Return a mask of {0, 1} at a size."""
+    if mask is None:
+        return None
+    grey = mask.astype(np.uint8)
+    if mask.shape == size:
+        return grey
+    shrunk = cv2.resize(grey * 255, size[::-1], interpolation=cv2.INTER_AREA)
+    return np.asarray(shrunk > _HALF, np.uint8)
