@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from tests.models.conftest import golden as golden
 from tests.models.conftest import published_state
-from trilitenet.commands.weights import import_weights, info
-from trilitenet.errors import OutputError, WeightsError
+from trilitenet.commands.synthesize import synthesize
+from trilitenet.commands.weights import finish, import_weights, info
+from trilitenet.errors import ConfigError, OutputError, WeightsError
+from trilitenet.models.weights import load_network, read_card, shipped_weights
 
 
 @pytest.fixture
@@ -49,3 +51,47 @@ def test_an_existing_file_is_kept(published: Path, tmp_path: Path) -> None:
 def test_info_of_what_is_not_there() -> None:
     with pytest.raises(WeightsError, match="does not exist"):
         info("nowhere.safetensors")
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("scenes")
+    synthesize(root, count=3, seed=5, size=(192, 320), split="val")
+    return root
+
+
+def test_finished_weights_hold_thresholds_figures_and_what_people_say(scenes: Path, tmp_path: Path) -> None:
+    first, second = tmp_path / "first.yaml", tmp_path / "second.yaml"
+    first.write_text("licence: research only\nprovenance: {labels: exact}\nnotes: [far vehicles are missed]\n")
+    second.write_text("provenance: {hours: '2'}\nnotes: [night is worse]\n")
+    out = tmp_path / "out.safetensors"
+    card = finish("tiny", out, data=scenes, card=(first, second), input_size=(192, 320), iou=0.5)
+    assert read_card(out) == card
+    assert card.licence == "research only"
+    assert {"labels": "exact", "hours": "2"}.items() <= card.provenance.items()
+    assert card.notes[-2:] == ("far vehicles are missed", "night is worse")
+    assert (card.input_size, card.thresholds.iou) == ((192, 320), 0.5)
+    assert 0 < card.metrics["val fair/drivable/iou"] <= 1
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+    shipped = load_network("tiny").state_dict()
+    assert all(torch.equal(tensor, shipped[name]) for name, tensor in load_network(out).state_dict().items())
+    with pytest.raises(OutputError, match="--overwrite"):
+        finish("tiny", out, data=scenes)
+
+
+def test_a_card_text_with_an_unknown_key_is_refused_before_the_work(scenes: Path, tmp_path: Path) -> None:
+    (tmp_path / "card.yaml").write_text("license: MIT\n")
+    with pytest.raises(ConfigError, match="licence"):
+        finish("tiny", tmp_path / "out.safetensors", data=scenes, card=(tmp_path / "card.yaml",))
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+def test_every_shipped_file_says_what_it_is() -> None:
+    for name in shipped_weights():
+        card = read_card(name)
+        assert card.variant == name
+        assert card.training_data
+        assert card.notes
+        assert "non-commercial" in card.licence
+        assert {"recipe", "seed", "hours", "hardware", "labels"} <= card.provenance.keys()
+        assert 0 < card.metrics["val fair/drivable/iou"] < 1

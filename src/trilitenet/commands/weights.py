@@ -1,17 +1,41 @@
-"""Weight files: convert published checkpoints, and see what a file says of itself."""
+"""Weight files: convert published checkpoints, finish trained weights for use, and see what a file says of itself."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-from trilitenet.config import ModelCard
-from trilitenet.errors import OutputError
-from trilitenet.models.weights import import_published, read_card, resolve_weights
+import yaml
 
-__all__ = ["import_weights", "info"]
+from trilitenet.commands.load import load
+from trilitenet.config import ModelCard, parse
+from trilitenet.data.reading import DrivingDataset
+from trilitenet.engine.evaluate import best_thresholds
+from trilitenet.engine.evaluate import evaluate as run_evaluation
+from trilitenet.errors import ConfigError, OutputError
+from trilitenet.models.weights import import_published, load_network, read_card, resolve_weights, save_network
+
+__all__ = ["CardText", "finish", "import_weights", "info"]
+
+
+@dataclasses.dataclass(frozen=True)
+class CardText:
+    """What people have to say of weights, read from YAML by `finish`.
+
+    Attributes:
+        training_data: One line a source, with counts and licence; the training run's own lines if left out.
+        licence: Licence and allowed use of the weights.
+        provenance: Added to what the training run wrote: labels, hardware, hours.
+        notes: What the weights are bad at, and anything a user should know.
+    """
+
+    training_data: tuple[str, ...] = ()
+    licence: str | None = None
+    provenance: dict[str, str] = dataclasses.field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 def import_weights(
@@ -32,6 +56,89 @@ def import_weights(
         raise OutputError(f"{destination}: exists already; give another name or --overwrite")
     card = import_published(source, destination, variant)
     sys.stdout.write(f"{destination}: {card.variant}, {card.classes} class(es), from {source.name}\n")
+    return card
+
+
+def finish(
+    source: str,
+    destination: Path,
+    /,
+    *,
+    data: Path,
+    split: str = "val",
+    card: Sequence[Path] = (),
+    input_size: tuple[int, int] | None = None,
+    iou: float | None = None,
+    batch_size: int = 8,
+    full: bool = False,
+    overwrite: bool = False,
+) -> ModelCard:
+    """Finish trained weights for use: fix the thresholds on a split, measure them there, write fp16 with the card.
+
+    The threshold of each task is the one that does best on the split (F1 of boxes at IoU 0.5, IoU of both masks). The
+    figures are those of the file as it is written, under the protocol fair.
+
+    Args:
+        source: Trained weights, for example runs/tiny/final.safetensors.
+        destination: The .safetensors file to write.
+        data: Root folder of a data set in the published layout.
+        split: Split that the thresholds are fixed and the figures measured on.
+        card: YAML files with training_data, licence, provenance and notes; the later add to the earlier.
+        input_size: Height and width the weights are meant for; those of the training run if left out.
+        iou: Overlap at which non-maximum suppression drops a box; the card's if left out.
+        batch_size: At most so many images go through the network at once.
+        full: Store 32-bit floats instead of fp16.
+        overwrite: Replace an existing destination.
+
+    Returns:
+        The card written into the file.
+    """
+    if destination.exists() and not overwrite:
+        raise OutputError(f"{destination}: exists already; give another name or --overwrite")
+    network = load_network(source)
+    described = _describe(network.card, [_read_card_text(path) for path in card])
+    if input_size is not None:
+        described = dataclasses.replace(described, input_size=input_size)
+    if iou is not None:
+        described = dataclasses.replace(described, thresholds=dataclasses.replace(described.thresholds, iou=iou))
+    dataset = DrivingDataset(data, split, class_names=described.class_names)
+    draft = destination.with_name(f".{destination.stem}.draft.safetensors")
+    try:
+        # Measured as stored: what the user loads is what the figures are of.
+        save_network(network, draft, dataclasses.replace(described, metrics={}), half=not full)
+        predictor = load(draft)
+        best = best_thresholds(predictor, dataset, batch_size=batch_size)
+        predictor.thresholds = best.thresholds
+        report = run_evaluation(predictor, dataset, batch_size=batch_size, resamples=0, worst=0)
+        figures = {f"{split} {name}": round(figure.value, 4) for name, figure in report.figures.items()}
+        finished = dataclasses.replace(described, thresholds=best.thresholds, metrics=figures)
+        save_network(network, destination, finished, half=not full)
+    finally:
+        draft.unlink(missing_ok=True)
+    sys.stdout.write(f"{destination}: {best.thresholds}\n{report.summary()}\n")
+    return finished
+
+
+def _read_card_text(path: Path) -> CardText:
+    try:
+        mapping = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: cannot be read as YAML ({' '.join(str(error).split())})") from error
+    if not isinstance(mapping, dict):
+        raise ConfigError(f"{path}: must hold 'key: value' lines")
+    return parse(CardText, mapping, str(path))
+
+
+def _describe(card: ModelCard, texts: Sequence[CardText]) -> ModelCard:
+    """Add what people say to what the training run wrote."""
+    for text in texts:
+        card = dataclasses.replace(
+            card,
+            training_data=text.training_data or card.training_data,
+            licence=text.licence or card.licence,
+            provenance=card.provenance | text.provenance,
+            notes=card.notes + text.notes,
+        )
     return card
 
 
