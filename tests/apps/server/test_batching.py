@@ -116,8 +116,8 @@ def test_closing_finishes_what_waits_and_takes_no_more(network: Network) -> None
 
 
 def test_a_delay_waits_for_company(network: Network) -> None:
-    sizes: list[tuple[int, float]] = []
-    batcher = Batcher(network, max_batch=2, delay=5.0, observe=lambda size, seconds: sizes.append((size, seconds)))
+    sizes: list[int] = []
+    batcher = Batcher(network, max_batch=2, delay=5.0, observe=sizes.append)
     network.gate.set()
     batcher.start()
     futures = [batcher.submit(canvas(i), LATER) for i in range(2)]
@@ -125,22 +125,69 @@ def test_a_delay_waits_for_company(network: Network) -> None:
         future.result(2)
     batcher.close(10)
     assert network.batches == [[0, 1]]
-    assert [size for size, _ in sizes] == [2]
+    assert sizes == [2]
+
+
+class Clock:
+    """Seconds that pass when a test says so."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
 
 
 def test_admission_counts_and_tells_how_long_to_wait() -> None:
-    admission = Admission(4)
+    clock = Clock()
+    admission = Admission(4, clock=clock)
+    admission.observe(1)  # the first run, before any request, teaches nothing
+    clock.now += 500
     admission.enter(3)
     with pytest.raises(BusyError):
         admission.enter(2)
     admission.enter(1)
-    for _ in range(100):
-        admission.observe(2.0)
-    with pytest.raises(BusyError) as caught:
-        admission.enter()
-    assert int(caught.value.headers["retry-after"]) == 8
+    for _ in range(50):
+        clock.now += 4.0
+        admission.observe(2)
+    for call in (admission.check, admission.enter):
+        with pytest.raises(BusyError) as caught:
+            call()
+        assert caught.value.code == "queue_full"
+        assert int(caught.value.headers["retry-after"]) == 8
     admission.leave(4)
     assert admission.taken == 0
+
+
+def test_a_slow_machine_gives_fewer_places_away() -> None:
+    clock = Clock()
+    admission = Admission(64, patience=6.0, clock=clock)
+    admission.enter(10)
+    for _ in range(100):
+        clock.now += 1.0
+        admission.observe(1)
+    with pytest.raises(BusyError, match="would take 10 s") as caught:
+        admission.enter()
+    assert caught.value.code == "queue_slow"
+    admission.leave(5)
+    admission.enter(1)
+    assert admission.taken == 6
+    # An image that takes longer than the patience alone still enters, and so does the next: else nothing ever would.
+    admission.leave(6)
+    for _ in range(100):
+        admission.enter()
+        clock.now += 60.0
+        admission.observe(1)
+        admission.leave()
+    admission.enter(1)
+    admission.enter(1)
+    with pytest.raises(BusyError):
+        admission.check()
+    # It recovers with the machine.
+    for _ in range(100):
+        clock.now += 0.01
+        admission.observe(1)
+    admission.enter(62)
 
 
 @pytest.mark.parametrize("missing", ["detection", "drivable", "lane"])

@@ -96,6 +96,27 @@ def test_a_body_that_does_not_arrive_times_out(make_app: MakeApp) -> None:
     assert app.service.memory.used == 0
 
 
+def test_without_room_a_body_is_dropped_as_it_comes(app: Application) -> None:
+    app.service.admission.enter(64)
+    pieces = [{"type": "http.request", "body": b"x" * 500, "more_body": index < 9} for index in range(10)]
+    sent = _call(app, [(b"content-length", b"5000")], pieces)
+    assert sent[0]["status"] == 503
+    headers = dict(sent[0]["headers"])
+    assert int(headers[b"retry-after"]) >= 1
+    assert b"connection" not in headers  # it can be used again
+    text = app.service.metrics.text().decode()
+    assert 'trilitenet_requests_total{method="POST",route="/v1/predict",status="503"} 1.0' in text
+    assert 'trilitenet_rejects_total{reason="queue_full"} 1.0' in text
+
+
+def test_without_room_a_client_that_asks_first_is_answered_first(app: Application) -> None:
+    app.service.admission.enter(64)
+    pieces = [{"type": "http.disconnect"}]
+    sent = _call(app, [(b"content-length", b"5000"), (b"expect", b"100-continue")], pieces)
+    assert sent[0]["status"] == 503
+    assert (b"connection", b"close") in sent[0]["headers"]
+
+
 def test_a_client_that_vanishes_while_sending_holds_nothing(app: Application) -> None:
     sent = _call(app, [(b"content-length", b"100")], [{"type": "http.disconnect"}])
     assert sent[0]["status"] == 499

@@ -108,6 +108,34 @@ def test_too_many_connections_are_refused_and_the_rest_served(make_app: MakeApp,
         assert first.recv(1000).startswith(b"HTTP/1.1 200")
 
 
+def test_a_refused_connection_can_be_read_after_a_long_body(make_app: MakeApp, run_app: Run) -> None:
+    running = run_app(make_app(max_connections=1))
+    with _connect(running) as first, _connect(running) as second:
+        second.sendall(b"POST /v1/predict HTTP/1.1\r\nhost: x\r\ncontent-length: 3000000\r\n\r\n" + b"x" * 3_000_000)
+        time.sleep(0.2)  # closing with bytes unread would have reset the connection by now
+        assert _read_all(second).startswith(b"HTTP/1.1 503")
+        first.sendall(b"GET /healthz HTTP/1.1\r\nhost: x\r\n\r\n")
+        assert first.recv(1000).startswith(b"HTTP/1.1 200")
+
+
+def test_a_full_service_answers_again_and_again_on_one_connection(make_app: MakeApp, run_app: Run, jpeg: bytes) -> None:
+    running = run_app(make_app(queue=1, max_images=1, keep_alive=1.0, header_timeout=0.3))
+    running.app.service.admission.enter()
+    client = http.client.HTTPConnection("127.0.0.1", running.port, timeout=10)
+    client.connect()
+    used = client.sock
+    for _ in range(3):
+        client.request("POST", "/v1/predict", body=jpeg + bytes(300_000))
+        answer = client.getresponse()
+        answer.read()
+        assert answer.status == 503
+        assert client.sock is used
+    running.app.service.admission.leave()
+    client.request("POST", "/v1/predict", body=jpeg)
+    assert client.getresponse().status == 200
+    client.close()
+
+
 def test_slow_clients_do_not_hold_up_others(make_app: MakeApp, run_app: Run, jpeg: bytes) -> None:
     running = run_app(make_app(queue=2, max_images=2))
     slow = [_connect(running) for _ in range(20)]

@@ -28,28 +28,49 @@ logger = logging.getLogger(__name__)
 
 
 class Admission:
-    """Counts the images that are accepted and not yet answered, and refuses more than there are places.
+    """Counts the images that are accepted and not yet answered, and refuses those that would wait too long.
+
+    There are so many places. Where the machine is slow, or busy with something else, fewer are given away: an image
+    that would be thrown away at its deadline costs as much as one that is answered, and would only delay others.
 
     Args:
         places: The most images at a time.
+        patience: The most seconds that those ahead of an image may be expected to take.
+        clock: Seconds that only grow; replaced in tests.
     """
 
-    def __init__(self, places: int) -> None:
+    def __init__(self, places: int, patience: float = math.inf, *, clock: Callable[[], float] = time.monotonic) -> None:
         self.places = places
+        self.patience = patience
         self.taken = 0
         self.seconds_each = 0.1
+        self._clock = clock
+        self._since = clock()
         self._lock = threading.Lock()
+
+    def check(self, count: int = 1) -> None:
+        """Refuse ``count`` images that there is no room for, without taking places.
+
+        Raises:
+            BusyError: If there is none; its Retry-After is the time that those ahead are expected to take.
+        """
+        expected = self.taken * self.seconds_each
+        wait = max(1, math.ceil(expected))
+        if self.taken + count > self.places:
+            raise BusyError("queue_full", f"all {self.places} places are taken; try again in {wait} s", wait)
+        if self.taken > 1 and expected > self.patience:  # the second always enters, so that the estimate can recover
+            raise BusyError("queue_slow", f"the images ahead would take {wait} s; try again then", wait)
 
     def enter(self, count: int = 1) -> None:
         """Take ``count`` places.
 
         Raises:
-            BusyError: If there are not as many; its Retry-After is the time that those ahead are expected to take.
+            BusyError: As `check`.
         """
         with self._lock:
-            if self.taken + count > self.places:
-                wait = max(1, math.ceil(self.taken * self.seconds_each))
-                raise BusyError("queue_full", f"all {self.places} places are taken; try again in {wait} s", wait)
+            self.check(count)
+            if self.taken == 0:
+                self._since = self._clock()
             self.taken += count
 
     def leave(self, count: int = 1) -> None:
@@ -57,9 +78,19 @@ class Admission:
         with self._lock:
             self.taken -= count
 
-    def observe(self, seconds: float) -> None:
-        """Learn how long one image takes, as a moving average, for Retry-After."""
-        self.seconds_each += 0.1 * (seconds - self.seconds_each)
+    def observe(self, count: int) -> None:
+        """Learn from ``count`` images that came through now how long one takes, as a moving average.
+
+        The time runs from the last ones that came through, or from when the places were all free: so it holds all
+        that an image costs, and what else the machine does meanwhile.
+        """
+        with self._lock:
+            if self.taken == 0:  # the first run, before any request
+                return
+            now = self._clock()
+            for _ in range(count):
+                self.seconds_each += 0.1 * ((now - self._since) / count - self.seconds_each)
+            self._since = now
 
 
 @dataclasses.dataclass
@@ -77,7 +108,7 @@ class Batcher:
         run: Takes (B, H, W, 3) uint8 RGB and returns the raw outputs of the batch.
         max_batch: The most canvases at once.
         delay: Seconds that a batch that is not full waits for more.
-        observe: Told the size of each batch and the seconds it took.
+        observe: Told the size of each batch that is through.
         clock: Seconds that only grow; replaced in tests.
     """
 
@@ -87,7 +118,7 @@ class Batcher:
         *,
         max_batch: int,
         delay: float = 0.0,
-        observe: Callable[[int, float], None] = lambda size, seconds: None,
+        observe: Callable[[int], None] = lambda size: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._run = run
@@ -195,7 +226,7 @@ class Batcher:
                 item.future.set_exception(error)
             return
         seconds = self._clock() - start
-        self._observe(len(batch), seconds)
+        self._observe(len(batch))
         for item, piece in zip(batch, pieces, strict=True):
             item.future.set_result((piece, start - item.entered, seconds))
 

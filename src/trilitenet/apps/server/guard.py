@@ -70,6 +70,8 @@ class Guard:
             try:
                 self._check(scope, exchange.headers)
             except ProblemError as problem:
+                if problem.status == 503 and "expect" not in exchange.headers:
+                    await exchange.drop_body()  # so that the connection can be used again
                 await problem_response(Request(scope), problem)(scope, exchange.receive, exchange.send)
             else:
                 await self._app(scope, exchange.receive, exchange.send)
@@ -99,6 +101,15 @@ class Guard:
             raise ProblemError(400, "bad_length", "the Content-Length is not a number")
         if int(declared[:20]) > self._service.settings.max_body:
             raise too_large(self._service.settings)
+        if scope["method"] == "POST":  # every POST wants a place: without one its body is not even kept
+            self._service.admission.check()
+
+
+def _label(path: str) -> str:
+    """Name the route of a path in metrics; there are few names, whatever clients ask for."""
+    if path in {"/v1/predict", "/v1/predict/batch"}:
+        return path
+    return "/v2/models/{model}/infer" if path.startswith("/v2/models/") and path.endswith("/infer") else "other"
 
 
 class _Exchange:
@@ -155,11 +166,11 @@ class _Exchange:
                 headers["connection"] = "close"
         elif message["type"] == "http.response.body" and not message.get("more_body") and not self._body_complete:
             await self._send({**message, "more_body": True})
-            await self._linger()
+            await self.drop_body()
             message = {"type": "http.response.body", "body": b"", "more_body": False}
         await self._send(message)
 
-    async def _linger(self) -> None:
+    async def drop_body(self) -> None:
         """Read on for a moment: closing at once would reset the connection and lose the answer on its way."""
         until = time.monotonic() + _LINGER
         while not self._body_complete and (left := until - time.monotonic()) > 0:
@@ -167,12 +178,14 @@ class _Exchange:
                 message = await asyncio.wait_for(self._receive(), left)
             except asyncio.TimeoutError:
                 return
+            self._received += len(message.get("body", b""))
             self._body_complete = message["type"] == "http.disconnect" or not message.get("more_body", False)
 
     def log(self) -> None:
         """Count and log the request. Nothing of its content is logged."""
         seconds = time.monotonic() - self._begin
-        route = getattr(self._scope.get("route"), "path", "other")
+        # Without a route it was refused before routing, or there is none.
+        route = getattr(self._scope.get("route"), "path", None) or _label(self._scope["path"])
         problem = self._scope["state"].get("problem")
         self._service.metrics.answer(route, self._scope["method"], self._status, seconds)
         if self._status == 499:

@@ -27,7 +27,10 @@ _MAX_HEADERS: Final = 32 * 1024
 """Bytes of a request's first line and headers."""
 
 _LAST_CALL: Final = 1.0
-"""Seconds that a connection without a request is given when the server stops."""
+"""Seconds that a connection without a request is given when the server stops, and a refused one to read why."""
+
+_GRACE: Final = 0.1
+"""Seconds more before headers count as late: on a busy machine they may lie unread since long."""
 
 _TCP_USER_TIMEOUT: Final = getattr(socket, "TCP_USER_TIMEOUT", None)
 
@@ -53,10 +56,14 @@ class GuardedProtocol(HttpToolsProtocol):
         self._stuck: asyncio.TimerHandle | None = None
         self._in_headers = True
         self._header_bytes = 0
+        self._refused = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Accept a connection, unless there are too many."""
         super().connection_made(transport)
+        if len(self.connections) > 2 * self.limits.max_connections:
+            transport.abort()  # too many even of those that are told so
+            return
         if len(self.connections) > self.limits.max_connections:
             self._refuse(503, "too many connections", "retry-after: 1\r\n")
             return
@@ -74,14 +81,14 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Take bytes; those of headers are counted."""
-        if self.transport.is_closing():
+        if self.transport.is_closing() or self._refused:
             return
         if self._in_headers:
             self._header_bytes += len(data)
         super().data_received(data)
         if self._in_headers and self._due is None and (self.cycle is None or self.cycle.response_complete):
             self._wait_for_headers()  # line breaks before a request begin no message, but end the idle time
-        if self._in_headers and self._header_bytes > _MAX_HEADERS and not self.transport.is_closing():
+        if self._in_headers and self._header_bytes > _MAX_HEADERS:
             self._refuse(431, "the headers are too long")
 
     def on_message_begin(self) -> None:
@@ -106,6 +113,8 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def shutdown(self) -> None:
         """The server stops: a client that has just connected is about to ask, so it gets a moment to do so."""
+        if self._refused:
+            return
         if self.cycle is None and not self.transport.is_closing():
             self._cancel()
             self._due = self.loop.call_later(_LAST_CALL, self.transport.close)
@@ -128,7 +137,13 @@ class GuardedProtocol(HttpToolsProtocol):
         self._due = self.loop.call_later(self.limits.header_timeout, self._headers_late)
 
     def _headers_late(self) -> None:
-        self._refuse(408, "the headers did not arrive in time")
+        self._due = self.loop.call_later(_GRACE, self._headers_lost)
+
+    def _headers_lost(self) -> None:
+        if self.cycle is not None and not self._header_bytes:
+            self.transport.close()  # between two requests
+        else:
+            self._refuse(408, "the headers did not arrive in time")
 
     def _cancel(self) -> None:
         if self._due is not None:
@@ -136,14 +151,21 @@ class GuardedProtocol(HttpToolsProtocol):
             self._due = None
 
     def _refuse(self, status: int, message: str, headers: str = "") -> None:
-        """Answer without the application, and close."""
+        """Answer without the application, then close; what still arrives is dropped, so that the answer is not."""
+        if self.transport.is_closing() or self._refused:
+            return
+        self._cancel()
+        if self.cycle is not None and not self.cycle.response_complete:
+            self.transport.close()  # an answer to an earlier request is on its way
+            return
+        self._refused = True
         body = json.dumps({"error": {"code": "connection", "message": message, "request_id": ""}})
-        if not self.transport.is_closing():
-            self.transport.write(
-                f"HTTP/1.1 {status} Refused\r\n{headers}content-type: application/json\r\n"
-                f"content-length: {len(body)}\r\nconnection: close\r\n\r\n{body}".encode()
-            )
-            self.transport.close()
+        self.transport.write(
+            f"HTTP/1.1 {status} Refused\r\n{headers}content-type: application/json\r\n"
+            f"content-length: {len(body)}\r\nconnection: close\r\n\r\n{body}".encode()
+        )
+        self.transport.write_eof()
+        self._due = self.loop.call_later(_LAST_CALL, self.transport.close)
 
 
 class GuardedServer(uvicorn.Server):

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,9 @@ __all__ = ["Encoded", "Outcome", "Service"]
 
 logger = logging.getLogger(__name__)
 _T = TypeVar("_T")
+
+_PATIENCE: Final = 0.6
+"""Share of the deadline that the images ahead of a new one may be expected to take."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +77,7 @@ class Service:
         self.card = predictor.card
         self.metrics = Metrics()
         self.memory = MemoryBudget(settings.memory)
-        self.admission = Admission(settings.queue)
+        self.admission = Admission(settings.queue, _PATIENCE * settings.deadline)
         self.draining = False
         self._warm = False
         self._batcher = Batcher(
@@ -237,9 +240,9 @@ class Service:
         milliseconds[stage] = round(seconds * 1e3, 3)
         self.metrics.stage(stage, seconds)
 
-    def _observe_batch(self, size: int, seconds: float) -> None:
+    def _observe_batch(self, size: int) -> None:
         self.metrics.batch(size)
-        self.admission.observe(seconds / size)
+        self.admission.observe(size)
 
 
 def _too_late() -> BusyError:
