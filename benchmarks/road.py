@@ -4,26 +4,44 @@ python benchmarks/road.py                          # true masks and boxes: the g
 python benchmarks/road.py --model tiny             # the network's masks and boxes
 python benchmarks/road.py --calibrate              # no camera file: the camera is estimated from the lanes
 python benchmarks/road.py --clip docs/images/drive.webp   # a short animated overlay
+python benchmarks/road.py --render drive           # drive/drive.mp4, camera.yaml and truth.json, and the figures
+python benchmarks/road.py --results results/drive.json --truth drive/truth.json   # what `trilitenet predict` made of it
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import json
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from PIL import Image
 
-from trilitenet.data.synthetic import Scene
+from trilitenet.data.synthetic import Scene, SceneTruth
 from trilitenet.data.synthetic_drive import SyntheticDrive
+from trilitenet.inference.video import VideoWriter
 from trilitenet.processing.drawing import draw
+from trilitenet.road.camera import write_camera
 from trilitenet.road.drawing import draw_road
 from trilitenet.road.monitor import RoadMonitor
-from trilitenet.road.structures import Road
 from trilitenet.road.tracking import Steady
 from trilitenet.structures import Boxes, Perception
+
+
+def true_figures(truth: SceneTruth) -> dict[str, Any]:
+    """Return what is compared, as JSON: metres, radians, 1/m, seconds."""
+    return {
+        "timestamp": truth.timestamp,
+        "lane_width": truth.lane_width,
+        "offset": truth.offset,
+        "heading": truth.heading,
+        "curvature": truth.curvature,
+        "lead": None if truth.lead is None else truth.lead.distance,
+    }
 
 
 def true_perception(scene: Scene) -> Perception:
@@ -50,35 +68,45 @@ class Errors:
         self.values: dict[str, list[float]] = {}
         self.frames = self.led = self.found = 0
 
-    def add(self, scene: Scene, road: Road) -> None:
-        """Compare one frame with its truth."""
+    def add(self, truth: dict[str, Any], road: dict[str, Any]) -> None:
+        """Compare the JSON form of one frame's road with its truth."""
         self.frames += 1
-        truth, lane = scene.truth, road.ego_lane
+        lane = road["ego_lane"]
         if lane is not None:
             for name in ("offset", "heading", "curvature"):
-                estimate = getattr(lane, name)
-                if estimate is None:
+                if lane[name] is None:
                     continue
-                apart = abs(estimate.value - getattr(truth, name))
-                if name == "offset" and truth.lane_width / 2 - abs(truth.offset) < 0.1:
-                    apart = min(apart, abs(apart - truth.lane_width))  # on the line between two lanes
+                apart = abs(lane[name]["value"] - truth[name])
+                if name == "offset" and truth["lane_width"] / 2 - abs(truth["offset"]) < 0.1:
+                    apart = min(apart, abs(apart - truth["lane_width"]))  # on the line between two lanes
                 self.values.setdefault(name, []).append(apart)
-        lead = truth.lead
-        if lead is not None and lead.distance <= 40:
+        lead = truth["lead"]
+        if lead is not None and lead <= 40:
             self.led += 1
-            if road.lead is not None:
+            if road["lead"] is not None:
                 self.found += 1
-                self.values.setdefault("lead", []).append(abs(road.lead.distance.value / lead.distance - 1))
+                self.values.setdefault("lead", []).append(abs(road["lead"]["distance"]["value"] / lead - 1))
 
     def show(self) -> None:
         """Print a table."""
         units = {"offset": ("m", 1), "heading": ("rad", 1), "curvature": ("1/m", 1), "lead": ("%", 100)}
-        print(f"{'':10} {'frames':>7} {'mean':>9} {'95%':>9} {'max':>9}")
+        print(f"{'':10} {'frames':>7} {'mean':>9} {'median':>9} {'95%':>9} {'max':>9}")
         for name, (unit, gain) in units.items():
             values = np.array(self.values.get(name, [np.nan])) * gain
-            figures = " ".join(f"{v:9.4f}" for v in (values.mean(), np.quantile(values, 0.95), values.max()))
+            figures = " ".join(
+                f"{v:9.4f}" for v in (values.mean(), np.median(values), np.quantile(values, 0.95), values.max())
+            )
             print(f"{name:10} {len(values):7d} {figures} {unit}")
         print(f"lead found in {self.found} of {self.led} frames with one up to 40 m; {self.frames} frames")
+
+
+def compare(results: Path, truth: Path) -> None:
+    """Print the errors of a file that `trilitenet predict --road` wrote."""
+    truths = json.loads(truth.read_text(encoding="utf-8"))
+    errors = Errors()
+    for frame in json.loads(results.read_text(encoding="utf-8"))["frames"]:
+        errors.add(truths[frame["frame"]], frame["road"])
+    errors.show()
 
 
 def main() -> None:
@@ -92,7 +120,15 @@ def main() -> None:
     parser.add_argument("--time", default="day", choices=("day", "dusk", "night"))
     parser.add_argument("--weather", default="clear", choices=("clear", "overcast", "rain", "fog"))
     parser.add_argument("--clip", type=Path, help="write an animated WebP of 5 seconds instead of figures")
+    parser.add_argument("--render", type=Path, help="write the drive to this folder: video, camera file, truth")
+    parser.add_argument("--results", type=Path, help="compare JSON of `trilitenet predict --road` with --truth")
+    parser.add_argument("--truth", type=Path, help="truth.json of --render")
     options = parser.parse_args()
+    if options.results:
+        if options.truth is None:
+            parser.error("--results needs --truth")
+        compare(options.results, options.truth)
+        return
     frames = round(options.seconds * options.fps)
     drive = SyntheticDrive(options.seed, frames, options.fps, time=options.time, weather=options.weather)
     predictor = None
@@ -104,16 +140,23 @@ def main() -> None:
     monitor = RoadMonitor(None if options.calibrate else drive.camera)
     errors, spent = Errors(), 0.0
     pictures: list[Image.Image] = []
+    truths: list[dict[str, Any]] = []
+    writer = None
+    if options.render:
+        options.render.mkdir(parents=True, exist_ok=True)
+        write_camera(drive.camera, options.render / "camera.yaml")
+        writer = VideoWriter(options.render / "drive.mp4", options.fps / options.stride, quality=25)
     indices = range(0, frames, options.stride)
     if options.clip:
         first = round(0.405 * frames)
         indices = range(first - 30, first + round(6 * options.fps), 2)
     for index in indices:
         scene = drive[index]
+        truths.append(true_figures(scene.truth))
+        if writer is not None:
+            writer.write(scene.sample.image, scene.truth.timestamp)
         perception = true_perception(scene)
         if predictor is not None:
-            import dataclasses
-
             seen = predictor(scene.sample.image)
             assert isinstance(seen, Perception)
             perception = dataclasses.replace(seen, timestamp=scene.truth.timestamp, image=scene.sample.image)
@@ -121,7 +164,7 @@ def main() -> None:
         perception = steady(perception)
         road = monitor(perception)
         spent += time.perf_counter() - begin
-        errors.add(scene, road)
+        errors.add(truths[-1], road.to_dict())
         if options.clip and index >= indices.start + 30:
             canvas = draw_road(draw(perception), perception, road)
             pictures.append(Image.fromarray(cv2.resize(canvas, (640, 360), interpolation=cv2.INTER_AREA)))
@@ -132,6 +175,9 @@ def main() -> None:
         )
         print(f"{options.clip}: {options.clip.stat().st_size / 2**20:.2f} MiB, {len(pictures)} pictures")
         return
+    if writer is not None:
+        writer.close()
+        (options.render / "truth.json").write_text(json.dumps(truths), encoding="utf-8")
     errors.show()
     print(f"tracking and road: {spent / errors.frames * 1e3:.2f} ms a frame")
 

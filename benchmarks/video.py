@@ -1,6 +1,7 @@
 """How much of pure inference speed a whole video keeps: decode, inference, drawing, JSON and encoding together.
 
     python benchmarks/video.py VIDEO --model tiny --device cpu
+    python benchmarks/video.py VIDEO --model tiny.xml --camera camera.yaml     # and the road in metres, with tracks
 
 Runs of pure inference and of the pipeline take turns in one process, so that a busy machine slows both; the ratio is
 the median over the rounds. Then each stage alone, in processor time a frame, tells what bounds the pipeline.
@@ -21,12 +22,14 @@ from pathlib import Path
 import numpy as np
 
 import trilitenet
-from trilitenet.commands.predict import predict_with
+from trilitenet.commands.predict import RoadOptions, predict_with
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, VideoReader
 from trilitenet.inference.video import VideoWriter
 from trilitenet.processing.drawing import draw
 from trilitenet.processing.letterbox import Letterbox
+from trilitenet.road.drawing import draw_road
+from trilitenet.road.structures import Road
 from trilitenet.structures import Perception, RawOutputs
 
 
@@ -38,14 +41,16 @@ def pure_inference(predictor: Predictor, batch: np.ndarray, frames: int) -> floa
     return -(-frames // len(batch)) * len(batch) / (time.perf_counter() - began)
 
 
-def pipeline(predictor: Predictor, video: Path, frames: int, overlay: bool) -> float:
+def pipeline(predictor: Predictor, video: Path, frames: int, overlay: bool, road: RoadOptions) -> float:
     """Return frames a second from file to file."""
     with tempfile.TemporaryDirectory() as folder:
-        report = predict_with(predictor, [video], Path(folder), clip=Clip(max_frames=frames), overlay=overlay)
+        report = predict_with(
+            predictor, [video], Path(folder), clip=Clip(max_frames=frames), overlay=overlay, road=road
+        )
     return report.frames / report.seconds
 
 
-def stages(predictor: Predictor, video: Path, frames: int) -> dict[str, float]:
+def stages(predictor: Predictor, video: Path, frames: int, options: RoadOptions) -> dict[str, float]:
     """Return each stage's processor time a frame in milliseconds, run alone."""
     taken: dict[str, float] = {}
 
@@ -70,13 +75,24 @@ def stages(predictor: Predictor, video: Path, frames: int) -> dict[str, float]:
             perceptions.extend(predictor.postprocess(raw, [letterbox for _, letterbox in boxed[part]], images[part]))
 
     measure("post-process", post)
-    measure("draw", lambda: [draw(perception) for perception in perceptions])
+    steady, monitor = options.open(still=False)
+    roads: list[Road] = []
+    if steady is not None:
+        measure("track", lambda: perceptions.__setitem__(slice(None), [steady(one) for one in perceptions]))
+    if monitor is not None:
+        measure("road", lambda: roads.extend(monitor(perception) for perception in perceptions))
+    canvases: list[np.ndarray] = []
+    measure("draw", lambda: canvases.extend(draw(perception) for perception in perceptions))
+    if roads:
+        measure("draw road", lambda: [draw_road(*drawn) for drawn in zip(canvases, perceptions, roads, strict=True)])
     measure("JSON", lambda: [json.dumps(perception.to_dict()) for perception in perceptions])
+    if roads:
+        measure("JSON of road", lambda: [json.dumps(road.to_dict()) for road in roads])
     with tempfile.TemporaryDirectory() as folder:
 
         def encode() -> None:
             with VideoWriter(Path(folder) / "out.mp4", 25.0) as writer:
-                for number, image in enumerate(images):
+                for number, image in enumerate(canvases):
                     writer.write(image, number / 25)
 
         measure("encode", encode)
@@ -93,7 +109,9 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--overlay", action=argparse.BooleanOptionalAction, default=True)
+    parser.add_argument("--camera", type=Path, help="measure the road with this camera, and track vehicles")
     options = parser.parse_args()
+    road = RoadOptions() if options.camera is None else RoadOptions(measure=True, camera=options.camera, track=True)
     predictor = trilitenet.load(
         options.model, device=options.device, backend=options.backend, batch_size=options.batch_size
     )
@@ -103,13 +121,13 @@ def main() -> None:
     rounds = []
     for _ in range(options.rounds):
         alone = pure_inference(predictor, batch, options.frames)
-        rounds.append((alone, pipeline(predictor, options.video, options.frames, options.overlay)))
+        rounds.append((alone, pipeline(predictor, options.video, options.frames, options.overlay, road)))
     print(f"machine: {platform.processor() or platform.machine()}, {os.cpu_count()} cores; {predictor.backend.name}")
     for alone, whole in rounds:
         print(f"pure inference {alone:7.1f} frames/s   pipeline {whole:7.1f} frames/s   ratio {whole / alone:.2f}")
     print(f"median ratio {statistics.median(whole / alone for alone, whole in rounds):.2f}")
     print("processor time a frame, each stage alone:")
-    for name, milliseconds in stages(predictor, options.video, min(100, options.frames)).items():
+    for name, milliseconds in stages(predictor, options.video, min(100, options.frames), road).items():
         print(f"  {name:12s} {milliseconds:7.2f} ms")
 
 
