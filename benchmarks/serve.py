@@ -5,7 +5,8 @@
 
 ``throughput`` alternates, several times, the predictor in-process at its best batch size and the service with 1, 8 and
 32 clients that wait for each answer. ``overload`` sends at twice the capacity whether answers come or not, and
-watches statuses and memory. Pictures are synthetic road scenes of 1280x720 as JPEG.
+watches statuses and memory. Pictures are synthetic road scenes of 1280x720 as JPEG. Both say how much processor time
+the clients took from the service.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import argparse
 import asyncio
 import dataclasses
 import io
+import itertools
+import os
 import signal
 import socket
 import statistics
@@ -23,7 +26,7 @@ import time
 import urllib.error
 import urllib.request
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +45,8 @@ class Load:
     seconds: float
     statuses: Counter[str]
     latencies: list[float]
+    cpu: float = 0.0
+    """Seconds of processor time that the clients took."""
 
     @property
     def rate(self) -> float:
@@ -85,7 +90,7 @@ async def closed_loop(port: int, bodies: list[bytes], clients: int, seconds: flo
     """Each client sends its next picture when it has the answer to the last."""
     statuses: Counter[str] = Counter()
     latencies: list[float] = []
-    begin = time.perf_counter()
+    begin, cpu = time.perf_counter(), time.process_time()
 
     async def one(number: int) -> None:
         client = Client(port)
@@ -97,11 +102,16 @@ async def closed_loop(port: int, bodies: list[bytes], clients: int, seconds: flo
         client.close()
 
     await asyncio.gather(*(one(number) for number in range(clients)))
-    return Load(time.perf_counter() - begin, statuses, latencies)
+    return Load(time.perf_counter() - begin, statuses, latencies, time.process_time() - cpu)
 
 
-async def open_loop(port: int, bodies: list[bytes], rate: float, seconds: float) -> Load:
-    """Send ``rate`` pictures a second, whether answers come or not; fresh idle connections are used again."""
+async def open_loop(
+    port: int, bodies: list[bytes], rate: float, seconds: float, watch: Callable[[float], object]
+) -> Load:
+    """Send ``rate`` pictures a second, whether answers come or not; fresh idle connections are used again.
+
+    ``watch`` is told the time about every second.
+    """
     statuses: Counter[str] = Counter()
     latencies: list[float] = []
     idle: list[tuple[float, Client]] = []
@@ -123,9 +133,12 @@ async def open_loop(port: int, bodies: list[bytes], rate: float, seconds: float)
             latencies.append(time.perf_counter() - start)
         idle.append((time.perf_counter(), client))
 
-    begin = time.perf_counter()
-    count = 0
+    begin, cpu = time.perf_counter(), time.process_time()
+    count = watched = 0
     while (now := time.perf_counter() - begin) < seconds:
+        if now >= watched:
+            watch(now)
+            watched = int(now) + 1
         while count < now * rate:
             task = asyncio.ensure_future(one(bodies[count % len(bodies)]))
             tasks.add(task)
@@ -135,7 +148,7 @@ async def open_loop(port: int, bodies: list[bytes], rate: float, seconds: float)
     await asyncio.gather(*tasks)
     for _, client in idle:
         client.close()
-    return Load(time.perf_counter() - begin, statuses, latencies)
+    return Load(time.perf_counter() - begin, statuses, latencies, time.process_time() - cpu)
 
 
 class Server:
@@ -164,6 +177,12 @@ class Server:
         """Resident MiB."""
         status = Path(f"/proc/{self._process.pid}/status").read_text(encoding="ascii")
         return int(status.split("VmRSS:")[1].split()[0]) / 1024
+
+    @property
+    def cpu(self) -> float:
+        """Seconds of processor time so far."""
+        fields = Path(f"/proc/{self._process.pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def stop(self) -> None:
         self._process.send_signal(signal.SIGTERM)
@@ -204,10 +223,13 @@ def throughput(arguments: argparse.Namespace) -> None:
         asyncio.run(closed_loop(server.port, bodies, 4, 2.0))
         loads: dict[int, list[Load]] = {clients: [] for clients in arguments.clients}
         ratios: dict[int, list[tuple[float, float]]] = {clients: [] for clients in arguments.clients}
+        service_cpu = dict.fromkeys(arguments.clients, 0.0)
         for _ in range(arguments.rounds):
             for clients in arguments.clients:
                 files = in_process(predictor, bodies, best, arguments.seconds)
+                before = server.cpu
                 load = asyncio.run(closed_loop(server.port, bodies, clients, arguments.seconds))
+                service_cpu[clients] += server.cpu - before
                 arrays = in_process(predictor, pixels, best, arguments.seconds)
                 loads[clients].append(load)
                 ratios[clients].append((load.rate / files, load.rate / arrays))
@@ -217,9 +239,12 @@ def throughput(arguments: argparse.Namespace) -> None:
         files, arrays = (statistics.median(values) for values in zip(*ratios[clients], strict=True))
         together = Load(1.0, Counter(), [latency for load in several for latency in load.latencies])
         statuses = dict(sum((load.statuses for load in several), Counter()))
+        wall = sum(load.seconds for load in several)
+        client_cpu = sum(load.cpu for load in several)
         print(
             f"{clients:3d} clients: {rate:6.1f} pictures/s, {together.percentiles()}; ratio to in-process "
-            f"(batch {best}): {files:.2f} given the same files, {arrays:.2f} given decoded arrays; answers {statuses}"
+            f"(batch {best}): {files:.2f} given the same files, {arrays:.2f} given decoded arrays; answers {statuses}; "
+            f"cores: service {service_cpu[clients] / wall:.2f}, clients {client_cpu / wall:.2f}"
         )
 
 
@@ -229,15 +254,27 @@ def overload(arguments: argparse.Namespace) -> None:
     try:
         capacity = asyncio.run(closed_loop(server.port, bodies, 16, 10.0)).rate
         print(f"capacity with 16 clients: {capacity:.1f} pictures/s; now {2 * capacity:.1f} a second")
-        step = arguments.seconds / 10
-        statuses: Counter[str] = Counter()
-        latencies: list[float] = []
-        for part in range(10):
-            load = asyncio.run(open_loop(server.port, bodies, 2 * capacity, step))
-            statuses += load.statuses
-            latencies += load.latencies
-            print(f"{(part + 1) * step:5.0f} s: {dict(load.statuses)}, resident {server.memory:.0f} MiB", flush=True)
-        print(f"answers {dict(statuses)}; {Load(1.0, statuses, latencies).percentiles()} of those seen")
+        resident = [(0.0, server.memory)]
+        service_cpu = server.cpu
+        load = asyncio.run(
+            open_loop(
+                server.port,
+                bodies,
+                2 * capacity,
+                arguments.seconds,
+                lambda now: resident.append((now, server.memory)),
+            )
+        )
+        service_cpu = server.cpu - service_cpu
+        print(f"resident before: {resident.pop(0)[1]:.0f} MiB; then, each second:")
+        for _, group in itertools.groupby(resident, key=lambda pair: int(10 * pair[0] / arguments.seconds)):
+            times, sizes = zip(*group, strict=True)
+            middle = statistics.median(sizes)
+            print(f"  from {times[0]:3.0f} s: {min(sizes):.0f} to {max(sizes):.0f} MiB, median {middle:.0f}")
+        print(
+            f"answers {dict(load.statuses)}; {load.percentiles()} of those seen; {load.rate:.1f} seen a second; "
+            f"cores: service {service_cpu / load.seconds:.2f}, clients {load.cpu / load.seconds:.2f}"
+        )
     finally:
         server.stop()
 

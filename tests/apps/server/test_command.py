@@ -72,7 +72,7 @@ def test_mistakes_are_told_in_one_line(started: list[Any], tmp_path: Path, capsy
             (["--token-file", str(short)], "at least 16 characters"),
             (["--queue", "0"], "queue must be at least 1"),
             (["--deadline", "-1"], "deadline must be positive"),
-            (["--port", port], "cannot listen on 127.0.0.1 port"),
+            (["--port", port], f"cannot listen on 127.0.0.1 port {port} (Address already in use); choose"),
             (["--port", "99999"], "cannot listen"),
         ):
             assert cli.main(["serve", *words]) == 1

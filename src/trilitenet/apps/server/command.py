@@ -65,7 +65,7 @@ def serve(
     import cv2
 
     from trilitenet.apps.server.application import create_app
-    from trilitenet.apps.server.process import build_server, set_up_logs
+    from trilitenet.apps.server.process import build_server, keep_freed_memory, set_up_logs
     from trilitenet.apps.server.settings import Settings
     from trilitenet.commands.load import load
 
@@ -84,6 +84,7 @@ def serve(
     )
     listener = _listen(host, port)
     set_up_logs(log_level.upper())
+    keep_freed_memory()
     cv2.setNumThreads(1)  # images are the unit of parallel work here
     # The network's thread takes Python's lock often and briefly; with the usual 5 ms each other thread delays it.
     sys.setswitchinterval(0.0005)
@@ -104,7 +105,7 @@ def _listen(host: str, port: int) -> socket.socket:
             (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET, backlog=1024
         )
     except OSError as error:
-        reason = error.strerror or error
+        reason = (error.strerror or str(error)).partition(" (while attempting")[0]  # what Python adds is said below
         raise ConfigError(f"cannot listen on {host} port {port} ({reason}); choose with --host and --port") from error
 
 
