@@ -1,11 +1,12 @@
 """The deploy graph against the same network exported plainly, and against eager PyTorch, in one interleaved run.
 
-    python benchmarks/speed.py --variant tiny small base --rounds 30
-    python benchmarks/speed.py --variant tiny --threads 1 --cpu-time   # a busy machine: processor time, not wall time
+    python benchmarks/speed.py --rounds 30
+    python benchmarks/speed.py --weights tiny --threads 1 --cpu-time   # a busy machine: processor time, not wall time
 
 'Plain' is the network as it is, traced to ONNX with float input and logits out: no decoding, no thresholds. 'Deploy'
-takes pixels and gives decoded boxes and decided masks. Weights are random unless --weights names files; times hardly
-depend on them. Ratios are medians over the rounds of plain time / own time.
+takes pixels and gives decoded boxes and decided masks. Weights are the shipped ones, or those that --weights names.
+Random ones would slow both down: their PReLU slopes are all alike, which OpenVINO then does not fuse into convolutions.
+Ratios are medians over the rounds of plain time / own time.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import openvino as ov
 import torch
 
 from trilitenet.config import ArtefactInfo, Thresholds
+from trilitenet.data.synthetic import SyntheticScenes
 from trilitenet.deploy.graph import DeployGraph
 from trilitenet.deploy.layouts import LAYOUTS, pick_layout
 from trilitenet.deploy.onnx import build_onnx
@@ -31,7 +32,9 @@ from trilitenet.deploy.openvino import build_openvino, has_amx, save_openvino
 from trilitenet.deploy.quantize import KEEP_STEPS, quantize_openvino
 from trilitenet.inference.openvino_backend import OpenVINOBackend
 from trilitenet.inference.predictor import Predictor
-from trilitenet.models.trilitenet import TriLiteNet, build_network, normalise_images
+from trilitenet.models.trilitenet import TriLiteNet, normalise_images
+from trilitenet.models.weights import load_network
+from trilitenet.processing.images import read_image
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.processing.nms import nms
 
@@ -44,7 +47,7 @@ def plain_onnx(network: TriLiteNet) -> bytes:
         warnings.simplefilter("ignore")
         program = torch.onnx.export(network, (torch.zeros(1, 3, *SIZE),), dynamo=True, opset_version=18, verbose=False)
     assert program is not None
-    return program.model_proto.SerializeToString()
+    return bytes(program.model_proto.SerializeToString())
 
 
 def openvino_call(model: ov.Model, precision: str, threads: int | None, streams: int = 1) -> Callable[[], None]:
@@ -74,6 +77,7 @@ def onnxruntime_call(data: bytes, threads: int | None) -> Callable[[], None]:
 
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
+    options.add_session_config_entry("session.force_spinning_stop", "1")  # else the next session's run is slowed down
     if threads:
         options.intra_op_num_threads = threads
     session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
@@ -83,8 +87,8 @@ def onnxruntime_call(data: bytes, threads: int | None) -> Callable[[], None]:
     return lambda: session.run(None, feed)
 
 
-def plain_frame(network: TriLiteNet, image: np.ndarray) -> None:
-    """Letterbox, eager network, interpolate, argmax, suppression: as published."""
+def plain_frame(network: TriLiteNet, image: np.ndarray, argmax: bool) -> None:
+    """Letterbox, eager network, interpolate, argmax (or a comparison), suppression: as published."""
     letterbox = Letterbox.fit(image.shape[:2])
     canvas = letterbox.image(image)
     with torch.inference_mode():
@@ -92,23 +96,16 @@ def plain_frame(network: TriLiteNet, image: np.ndarray) -> None:
         rows = network.decode(outputs)[0]
         for logits in (outputs.drivable, outputs.lane):
             inside = logits[:, :, letterbox.inside[0], letterbox.inside[1]]
-            torch.nn.functional.interpolate(inside, size=image.shape[:2], mode="bilinear").argmax(1).numpy()
-        rows = rows[rows[:, 4] > 0.25].numpy()
-    xyxy = np.concatenate((rows[:, :2] - rows[:, 2:4] / 2, rows[:, :2] + rows[:, 2:4] / 2), 1)
-    nms(xyxy, rows[:, 4] * rows[:, 5], np.zeros(len(rows), np.int64), 0.6, 300)
+            logits = torch.nn.functional.interpolate(inside, size=image.shape[:2], mode="bilinear")
+            (logits.argmax(1) if argmax else logits[:, 1] > logits[:, 0]).numpy()
+        kept = rows[rows[:, 4] > 0.25].numpy()
+    xyxy = np.concatenate((kept[:, :2] - kept[:, 2:4] / 2, kept[:, :2] + kept[:, 2:4] / 2), 1)
+    nms(xyxy, kept[:, 4] * kept[:, 5], np.zeros(len(rows), np.int64), 0.6, 300)
 
 
-def few_boxes(network: TriLiteNet) -> TriLiteNet:
-    """Lower the objectness of random weights, so that a frame has few boxes, as a trained network's has."""
-    with torch.no_grad():
-        for conv in network.detection.convs:
-            conv.bias.view(3, -1)[:, 4] -= 8
-    return network
-
-
-def measure(variant: str, arguments: argparse.Namespace, folder: Path) -> dict[str, dict[str, float]]:
-    torch.manual_seed(0)
-    network = few_boxes(build_network(variant).eval())
+def measure(weights: str, arguments: argparse.Namespace, folder: Path) -> dict[str, dict[str, float]]:
+    network = load_network(weights).eval()
+    variant = network.card.variant
     plain = plain_onnx(network)
     plain_model = CORE.read_model(plain, b"")
     auto = pick_layout(arguments.layout, variant, "openvino", amx=has_amx())
@@ -116,8 +113,7 @@ def measure(variant: str, arguments: argparse.Namespace, folder: Path) -> dict[s
     proto = build_onnx(DeployGraph(network, auto), network.card, info)
     deploy = build_openvino(proto)
     threads = arguments.threads
-    image = np.random.default_rng(0).integers(0, 256, (720, 1280, 3), np.uint8)
-    image = cv2.blur(image, (9, 9))
+    image = SyntheticScenes(0, (720, 1280))[0].image if arguments.image is None else read_image(arguments.image)
 
     calls: dict[str, Callable[[], object]] = {
         "plain openvino bf16": openvino_call(plain_model, "bf16", threads),
@@ -151,7 +147,8 @@ def measure(variant: str, arguments: argparse.Namespace, folder: Path) -> dict[s
         doubled = ArtefactInfo("openvino", "bf16", SIZE, mask_scale=2)
         save_openvino(build_openvino(build_onnx(big, network.card, doubled)), path, network.card, doubled)
         predictor = Predictor(OpenVINOBackend(path, threads=threads))
-        calls["plain frame"] = lambda: plain_frame(network, image)
+        calls["plain frame"] = lambda: plain_frame(network, image, argmax=True)
+        calls["plain frame, comparing"] = lambda: plain_frame(network, image, argmax=False)
         calls["deploy frame"] = lambda: predictor.perceive([image])
 
     clock = time.process_time if arguments.cpu_time else time.perf_counter
@@ -177,7 +174,7 @@ def measure(variant: str, arguments: argparse.Namespace, folder: Path) -> dict[s
 
 def ratio(times: dict[str, list[float]], name: str) -> float:
     """Return the median over the rounds of the plain counterpart's time over this one's."""
-    kind = "plain frame" if name.endswith("frame") else "plain openvino bf16"
+    kind = "plain frame" if "frame" in name else "plain openvino bf16"
     if "onnxruntime" in name:
         kind = "plain onnxruntime fp32"
     elif "streams" in name:
@@ -187,7 +184,8 @@ def ratio(times: dict[str, list[float]], name: str) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--variant", nargs="+", default=["tiny", "small", "base"])
+    parser.add_argument("--weights", nargs="+", default=["tiny", "small", "base"], help="names or files")
+    parser.add_argument("--image", type=Path, help="of the whole frames; a synthetic 1280x720 one by default")
     parser.add_argument("--rounds", type=int, default=30)
     parser.add_argument("--threads", type=int)
     parser.add_argument("--layout", default="auto", choices=["auto", *LAYOUTS])
@@ -198,8 +196,9 @@ def main() -> None:
     arguments = parser.parse_args()
     results = {}
     with tempfile.TemporaryDirectory() as folder:
-        for variant in arguments.variant:
-            results[variant] = measure(variant, arguments, Path(folder))
+        for weights in arguments.weights:
+            variant = load_network(weights).card.variant
+            results[variant] = measure(weights, arguments, Path(folder))
             print(f"{variant}: milliseconds p10, p50, p99; plain / own")
             for name, row in results[variant].items():
                 print(

@@ -209,17 +209,22 @@ class UpStageGraph(nn.Module):
     Args:
         stage: The network's.
         layout: How to lay it out.
-        block: Side of the pixel blocks of its output.
+        source: Side of the pixel blocks of its input.
+        block: Side of the pixel blocks of the image and of its output, at most twice ``source``.
+        before: Channels a pixel in front of those of the image, which are left alone; only where ``layout`` splits.
     """
 
-    def __init__(self, stage: UpStage, layout: Layout, block: int) -> None:
+    def __init__(self, stage: UpStage, layout: Layout, source: int, block: int, before: int = 0) -> None:
         super().__init__()
         slopes = prelu_slopes(stage.up.act, stage.up.deconv.out_channels)
         self.up: FusedConv | FusedTransposedConv
-        if layout.channels_last or block == 2:
+        if layout.channels_last or block > 1:
             kernel = transposed_as_pointwise(stage.up.deconv.weight, stage.up.bn)
-            self.up = FusedConv(kernel, slopes.repeat(4), maximum=layout.maximum)
-            self.unblock = 2 // block
+            kernel = space_to_depth_kernel(kernel, (source, source), (source, source))
+            self.unblock = 2 * source // block
+            if self.unblock != source:  # else what the blocks of the input become is what is taken apart
+                kernel = nest_blocks(kernel, source)
+            self.up = FusedConv(kernel, slopes.repeat(4 * source * source), maximum=layout.maximum)
         else:
             self.up = FusedTransposedConv(stage.up.deconv, stage.up.bn, slopes, maximum=layout.maximum)
             self.unblock = 1
@@ -227,6 +232,7 @@ class UpStageGraph(nn.Module):
         kernel, slopes = fold_block(stage.conv1)
         slopes = slopes.repeat(block * block)
         x, image = split_inputs(kernel, len(kernel.weight), 3)
+        image = pad_inputs(image, before)
         x, image = (space_to_depth_kernel(part, blocks, blocks) for part in (x, image))
         self.image = None
         if layout.split:
@@ -239,7 +245,7 @@ class UpStageGraph(nn.Module):
         self.conv2 = FusedConv(kernel, slopes.repeat(block * block), maximum=layout.maximum)
 
     def forward(self, x: Tensor, image: Tensor) -> Tensor:
-        """Map (B, C, H, W) and the image at twice the size to a map of that size, in blocks."""
+        """Map (B, C, H, W) and the image at twice the size to a map of that size; all in blocks."""
         x = self.up(x)
         if self.unblock > 1:
             x = depth_to_space(x, self.unblock)
@@ -257,14 +263,23 @@ class MaskGraph(nn.Module):
         masks: What the mask holds.
         scale: Mask pixels an input pixel, along an axis: 1 or 2.
         threshold: Probability above which a pixel is foreground.
+        before: Channels a pixel in front of those of the pooled image, which are left alone.
     """
 
-    def __init__(self, head: SegmentationHead, layout: Layout, masks: Masks, scale: int, threshold: float) -> None:
+    def __init__(
+        self,
+        head: SegmentationHead,
+        layout: Layout,
+        masks: Masks,
+        scale: int,
+        threshold: float,
+        before: int = 0,
+    ) -> None:
         super().__init__()
         self.masks = masks
         self.channels_last = layout.channels_last
-        self.up1 = UpStageGraph(head.up1, layout, 1)
-        self.up2 = UpStageGraph(head.up2, layout, layout.half)
+        self.up1 = UpStageGraph(head.up1, layout, 1, layout.quarter)
+        self.up2 = UpStageGraph(head.up2, layout, layout.quarter, layout.half, before)
         slopes = prelu_slopes(head.out.act, 2)
         threshold = 0.5 if masks == "probability" else threshold
         self.out: FusedConv | FusedTransposedConv
@@ -272,7 +287,7 @@ class MaskGraph(nn.Module):
         self.enlarge: FusedConv | None = None
         self.scale = scale
         half = layout.half
-        if layout.channels_last or half == 2:
+        if layout.channels_last or half > 1:
             kernel = transposed_as_pointwise(head.out.deconv.weight, head.out.bn)
             kernel = space_to_depth_kernel(kernel, (half, half), (half, half))
             self.out = FusedConv(nest_blocks(kernel, half), slopes.repeat(4 * half * half), maximum=layout.maximum)
@@ -348,13 +363,13 @@ class DeployGraph(nn.Module):
         encoder = network.encoder
         maximum = layout.maximum
         front = (layout.front, layout.front)
-        # With channels-last input, pairs of rows and columns are regrouped, so that the stem has 12 inputs, not 3.
+        # Channels-last, neighbours in a row share a cell: a mere view of the pixels, and the stem has 6 or 12 inputs.
         self.block = 2 * layout.front if layout.channels_last else 1
-        source = (self.block, self.block)
+        source = (1, self.block)
 
         scale, shift = fold_normalisation(network.card.mean, network.card.std)
-        self.scale = constant((scale.flip(0) if bgr else scale).repeat(self.block**2))
-        self.shift = constant((shift.flip(0) if bgr else shift).repeat(self.block**2))
+        self.scale = constant((scale.flip(0) if bgr else scale).repeat(self.block))
+        self.shift = constant((shift.flip(0) if bgr else shift).repeat(self.block))
 
         kernel, slopes = fold_block(encoder.level1)
         wide = len(slopes)
@@ -365,8 +380,17 @@ class DeployGraph(nn.Module):
         )
         pool = pool_kernel(3)
         self.i2 = FusedConv(space_to_depth_kernel(pad_inputs(pool, wide), front, (1, 1)))
-        pool = reverse_inputs(pool) if bgr else pool
-        self.i1 = FusedConv(space_to_depth_kernel(pool, source, (layout.half, layout.half)))
+        self.i2_blocks: FusedConv | None = None
+        if layout.quarter > 1:
+            quarter = (layout.quarter, layout.quarter)
+            self.i2_blocks = FusedConv(space_to_depth_kernel(pad_inputs(pool, wide), front, quarter))
+        # Where the heads want the pooled image in the blocks that the stem gave it, they find it there.
+        self.i1: FusedConv | None = None
+        before = wide
+        if not (layout.split and layout.half == layout.front > 1):
+            pool = reverse_inputs(pool) if bgr else pool
+            self.i1 = FusedConv(space_to_depth_kernel(pool, source, (layout.half, layout.half)))
+            before = 0
 
         kernel, slopes = fold_block(encoder.b1)
         self.b1 = FusedConv(
@@ -396,9 +420,9 @@ class DeployGraph(nn.Module):
         self.drivable: MaskGraph | None = None
         self.lane: MaskGraph | None = None
         if network.drivable is not None:
-            self.drivable = MaskGraph(network.drivable, layout, masks, mask_scale, thresholds.drivable)
+            self.drivable = MaskGraph(network.drivable, layout, masks, mask_scale, thresholds.drivable, before)
         if network.lane is not None:
-            self.lane = MaskGraph(network.lane, layout, masks, mask_scale, thresholds.lane)
+            self.lane = MaskGraph(network.lane, layout, masks, mask_scale, thresholds.lane, before)
         self.eval()
 
     def forward(self, image: Tensor) -> DeployOutputs:
@@ -432,7 +456,8 @@ class DeployGraph(nn.Module):
             detection = self.detection(c3, c4, self.c5(c4))
         if self.reduce is not None:
             attended = self.reduce(c3 if self.pcaa is None else self.pcaa(c3))
-            i1 = self.i1(x)
+            i1 = front if self.i1 is None else self.i1(x)
+            i2 = i2 if self.i2_blocks is None else self.i2_blocks(front)
             if self.drivable is not None:
                 drivable = self.drivable(attended, i1, i2)
             if self.lane is not None:
@@ -452,9 +477,8 @@ class DeployGraph(nn.Module):
         if not self.layout.channels_last:
             x = image.permute(0, 3, 1, 2).float()
             return x * self.scale.view(1, 3, 1, 1) + self.shift.view(1, 3, 1, 1)
-        block = self.block
-        x = image.reshape(batch, height // block, block, width // block, block * 3).permute(0, 1, 3, 2, 4)
-        # (B, H / block, W / block x block^2 x 3): one long row of cells
-        x = x.reshape(batch, height // block, -1).float()
-        x = x * self.scale.repeat(width // block) + self.shift.repeat(width // block)
-        return x.view(batch, height // block, width // block, block * block * 3).permute(0, 3, 1, 2)
+        # One long row of cells: (B, H, W / block x block x 3)
+        cells = width // self.block
+        x = image.reshape(batch, height, -1).float()
+        x = x * self.scale.repeat(cells) + self.shift.repeat(cells)
+        return x.view(batch, height, cells, self.block * 3).permute(0, 3, 1, 2)

@@ -46,19 +46,23 @@ class Layout:
             convolutions; for runtimes whose convolutions are channels-last. Otherwise plain (B, C, H, W) operators of
             at most four dimensions, and transposed convolutions as such.
         front: Side of the pixel blocks that share a cell at 1/2 resolution in the encoder (1 or 2; see `rewrites`).
-        half: The same in the segmentation heads at 1/2; 2 also writes their last transposed convolutions as 1x1.
+        quarter: The same in the segmentation heads at 1/4 (1 or 2).
+        half: The same in the segmentation heads at 1/2, at most twice ``quarter``; above 1 it also writes their last
+            transposed convolutions as 1x1.
         split: Write conv(concat(x, image)) as conv(x) + conv(image).
         maximum: Write PReLU as max(x, a x) where that is exact.
     """
 
     channels_last: bool = True
     front: int = 1
+    quarter: int = 1
     half: int = 1
     split: bool = False
     maximum: bool = False
 
     def __post_init__(self) -> None:
-        assert self.channels_last or self.front == 1
+        assert self.channels_last or self.front == self.quarter == 1
+        assert self.front <= self.half <= 2 * self.quarter
 
 
 def constant(value: Tensor) -> nn.Parameter:

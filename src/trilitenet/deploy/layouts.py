@@ -10,13 +10,16 @@ from trilitenet.errors import ConfigError, did_you_mean
 __all__ = ["LAYOUTS", "pick_layout"]
 
 LAYOUTS: Final[dict[str, Layout]] = {
-    "wide": Layout(front=2, half=2, split=True),
+    "wide": Layout(front=2, quarter=2, half=2, split=True),
     "heads": Layout(half=2),
+    "heads-split": Layout(half=2, split=True),
     "pixels": Layout(),
     "planar": Layout(channels_last=False),
     "planar-maximum": Layout(channels_last=False, maximum=True),
+    "planar-maximum-heads": Layout(channels_last=False, maximum=True, half=2, split=True),
+    "planar-maximum-split": Layout(channels_last=False, maximum=True, split=True),
 }
-"""Layouts by name: pixels in 2x2 blocks at 1/2 everywhere, in the heads, nowhere; and (B, C, H, W) throughout."""
+"""Layouts by name: pixels in 2x2 blocks everywhere, in the heads, nowhere; and (B, C, H, W) throughout."""
 
 
 def pick_layout(name: str, variant: str, runtime: str, *, amx: bool) -> Layout:
@@ -37,9 +40,9 @@ def pick_layout(name: str, variant: str, runtime: str, *, amx: bool) -> Layout:
             raise ConfigError(f"unknown layout {name!r}{did_you_mean(name, [*LAYOUTS, 'auto'])}")
         return LAYOUTS[name]
     if runtime == "onnxruntime":
-        return LAYOUTS["planar-maximum"]
+        return LAYOUTS["planar-maximum-split" if variant == "base" else "planar-maximum-heads"]
     if runtime != "openvino":
         return LAYOUTS["planar"]
     if amx:
-        return Layout(half=2, split=True) if variant == "base" else LAYOUTS["wide"]
+        return LAYOUTS["wide" if variant == "tiny" else "heads-split"]
     return LAYOUTS["heads" if variant == "tiny" else "pixels"]

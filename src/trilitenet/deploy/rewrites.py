@@ -58,7 +58,7 @@ class Kernel(NamedTuple):
         weight: (out, in / groups, kernel height, kernel width).
         bias: (out,).
         padding: Zeros added at the top, left, bottom, right.
-        stride: Rows and columns (the same).
+        stride: Rows and columns.
         dilation: Rows and columns (the same).
         groups: 1, or the number of channels for a depthwise convolution.
     """
@@ -66,7 +66,7 @@ class Kernel(NamedTuple):
     weight: Tensor
     bias: Tensor
     padding: tuple[int, int, int, int] = (0, 0, 0, 0)
-    stride: int = 1
+    stride: tuple[int, int] = (1, 1)
     dilation: int = 1
     groups: int = 1
 
@@ -77,7 +77,7 @@ def conv_kernel(conv: nn.Conv2d) -> Kernel:
     bias = torch.zeros(len(weight), dtype=torch.float64) if conv.bias is None else conv.bias.detach().double()
     pad = conv.padding[0]
     assert isinstance(pad, int)
-    return Kernel(weight, bias, (pad,) * 4, conv.stride[0], conv.dilation[0], conv.groups)
+    return Kernel(weight, bias, (pad,) * 4, (conv.stride[0], conv.stride[1]), conv.dilation[0], conv.groups)
 
 
 def fold_batch_norm(kernel: Kernel, norm: nn.BatchNorm2d) -> Kernel:
@@ -194,7 +194,7 @@ def prelu_as_maximum(slopes: Tensor) -> bool:
 def pool_kernel(channels: int) -> Kernel:
     """Write the 3x3 stride-2 average pool (padding counted) as a dense convolution: 1/9 on the diagonal."""
     weight = torch.eye(channels, dtype=torch.float64).view(channels, channels, 1, 1).repeat(1, 1, 3, 3) / 9
-    return Kernel(weight, torch.zeros(channels, dtype=torch.float64), (1, 1, 1, 1), 2)
+    return Kernel(weight, torch.zeros(channels, dtype=torch.float64), (1, 1, 1, 1), (2, 2))
 
 
 def merge_pool_into_stem(stem: Kernel, slopes: Tensor) -> tuple[Kernel, Tensor]:
@@ -265,31 +265,30 @@ def space_to_depth_kernel(kernel: Kernel, source: Blocks, target: Blocks) -> Ker
     out, inputs, *size = kernel.weight.shape
     steps, lows, highs = [], [], []
     for axis in range(2):
-        step, remainder = divmod(kernel.stride * target[axis], source[axis])
+        step, remainder = divmod(kernel.stride[axis] * target[axis], source[axis])
         assert remainder == 0
         cells = [
-            (kernel.stride * r + t - kernel.padding[axis]) // source[axis]
+            (kernel.stride[axis] * r + t - kernel.padding[axis]) // source[axis]
             for r in range(target[axis])
             for t in range(size[axis])
         ]
         steps.append(step)
         lows.append(min(cells))
         highs.append(max(cells))
-    assert steps[0] == steps[1]
     taps = [high - low + 1 for low, high in zip(lows, highs, strict=True)]
     weight = kernel.weight.new_zeros(*target, out, *source, inputs, *taps)
     for r in range(target[0]):
         for c in range(target[1]):
             for t in range(size[0]):
                 for u in range(size[1]):
-                    cell_y, y = divmod(kernel.stride * r + t - kernel.padding[0], source[0])
-                    cell_x, x = divmod(kernel.stride * c + u - kernel.padding[1], source[1])
+                    cell_y, y = divmod(kernel.stride[0] * r + t - kernel.padding[0], source[0])
+                    cell_x, x = divmod(kernel.stride[1] * c + u - kernel.padding[1], source[1])
                     weight[r, c, :, y, x, :, cell_y - lows[0], cell_x - lows[1]] = kernel.weight[:, :, t, u]
     weight = weight.reshape(math.prod(target) * out, math.prod(source) * inputs, *taps)
-    step = steps[0]
     # The last cell of an axis of n output cells reads up to cell step (n - 1) + high of step n: high - step + 1 beyond.
-    padding = (-lows[0], -lows[1], max(highs[0] - step + 1, 0), max(highs[1] - step + 1, 0))
-    return Kernel(weight, kernel.bias.repeat(math.prod(target)), padding, step)
+    beyond = [max(high - step + 1, 0) for high, step in zip(highs, steps, strict=True)]
+    padding = (-lows[0], -lows[1], beyond[0], beyond[1])
+    return Kernel(weight, kernel.bias.repeat(math.prod(target)), padding, (steps[0], steps[1]))
 
 
 def mask_difference(blocks: int, threshold: float) -> Kernel:

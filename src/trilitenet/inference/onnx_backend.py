@@ -50,6 +50,8 @@ class OnnxBackend:
             providers.insert(0, "CUDAExecutionProvider")
         options = runtime.SessionOptions()
         options.log_severity_level = 3
+        # Between two frames the threads would spin, while the next frame is read and prepared on the same cores.
+        options.add_session_config_entry("session.force_spinning_stop", "1")
         if threads is not None:
             options.intra_op_num_threads = threads
         try:
