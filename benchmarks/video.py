@@ -82,7 +82,7 @@ def stages(predictor: Predictor, video: Path, frames: int, options: RoadOptions)
     if monitor is not None:
         measure("road", lambda: roads.extend(monitor(perception) for perception in perceptions))
     canvases: list[np.ndarray] = []
-    measure("draw", lambda: canvases.extend(draw(perception) for perception in perceptions))
+    measure("draw", lambda: canvases.extend(draw(one, out=one.image) for one in perceptions))
     if roads:
         measure("draw road", lambda: [draw_road(*drawn) for drawn in zip(canvases, perceptions, roads, strict=True)])
     measure("JSON", lambda: [json.dumps(perception.to_dict()) for perception in perceptions])
