@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
@@ -31,3 +33,20 @@ def test_undefined_draws_are_left_out() -> None:
     assert interval(np.array([np.nan, 0.2, 0.2, 0.2])) == pytest.approx((0.2, 0.2))
     assert np.isnan(interval(np.array([np.nan]))).all()
     assert bootstrap(lambda weights: {"a": weights.sum(axis=1)}, 3, 0) == {}
+
+
+def test_values_come_in_the_order_of_the_draws_whichever_thread_is_first() -> None:
+    def first_image(weights: np.ndarray) -> dict[str, np.ndarray]:
+        time.sleep(0.002 * (weights[0, 0] % 3))
+        return {"first": weights[:, 0].astype(float)}
+
+    wanted = np.concatenate([part[:, 0] for part in draws(5, 950, seed=1)])
+    np.testing.assert_array_equal(bootstrap(first_image, 5, 950, seed=1)["first"], wanted)
+
+
+def test_an_error_in_a_thread_is_raised() -> None:
+    def fail(weights: np.ndarray) -> dict[str, np.ndarray]:
+        raise ValueError("broken")
+
+    with pytest.raises(ValueError, match="broken"):
+        bootstrap(fail, 5, 500)

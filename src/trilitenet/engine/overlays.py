@@ -13,7 +13,7 @@ from trilitenet.engine.scoring import LabelledImage
 from trilitenet.metrics.arithmetic import box_cover, box_overlap
 from trilitenet.structures import Perception
 
-__all__ = ["FALSE", "IGNORED", "MISSED", "RIGHT", "error_overlay"]
+__all__ = ["FALSE", "IGNORED", "MISSED", "RIGHT", "error_overlay", "shrunken"]
 
 RIGHT: Final = (0, 158, 115)
 """RGB of what prediction and truth share (colours of Okabe and Ito, told apart with colour-blind eyes)."""
@@ -25,29 +25,46 @@ IGNORED: Final = (150, 150, 150)
 """RGB of ignored regions."""
 
 
+def shrunken(image: NDArray[np.uint8], width: int = 480) -> NDArray[np.uint8]:
+    """Return an (H, W, 3) image shrunk by a whole number, so that it is at most ``width`` pixels across."""
+    height, full = image.shape[:2]
+    scale = 1 / -(-full // width)
+    return _shrink(image, (max(1, round(full * scale)), max(1, round(height * scale))))
+
+
+def _shrink(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Shrink to (width, height), halving as often as that leaves enough: OpenCV halves ten times faster."""
+    while image.shape[1] >= 2 * size[0] and image.shape[0] >= 2 * size[1]:
+        half = (image.shape[1] // 2, image.shape[0] // 2)
+        image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), np.uint8)
+
+
 def error_overlay(
-    sample: LabelledImage, prediction: Perception, task: Task, *, confidence: float, width: int = 480, quality: int = 80
+    small: NDArray[np.uint8],
+    sample: LabelledImage,
+    prediction: Perception,
+    task: Task,
+    *,
+    confidence: float,
+    quality: int = 80,
 ) -> bytes:
     """Draw right, false and missed in three colours.
 
     Args:
-        sample: The image and its labels.
-        prediction: In pixels of the image.
+        small: The sample's image, as `shrunken` makes it; it stays as it is.
+        sample: The labels.
+        prediction: In pixels of the sample's image.
         task: The task to show.
         confidence: Boxes above this are drawn.
-        width: At most so many pixels across the picture.
         quality: Of the JPEG, 1 to 100.
 
     Returns:
         The bytes of a JPEG file.
     """
-    height, full = sample.image.shape[:2]
-    # Shrinking by a whole number is many times faster.
-    scale = 1 / -(-full // width)
-    size = (max(1, round(full * scale)), max(1, round(height * scale)))
-    picture = cv2.resize(sample.image, size, interpolation=cv2.INTER_AREA)
+    picture = small.copy()
     if task == "detection":
-        _draw_boxes(picture, sample, prediction, confidence, scale)
+        _draw_boxes(picture, sample, prediction, confidence, small.shape[1] / sample.image.shape[1])
     else:
         predicted, true = getattr(prediction, task), getattr(sample, task)
         if predicted is not None and true is not None:
@@ -56,14 +73,20 @@ def error_overlay(
     return bytes(np.asarray(encoded, np.uint8))
 
 
+_BY_PREDICTED_AND_TRUE: Final = np.array([(0, 0, 0), FALSE, MISSED, RIGHT], np.uint8)
+
+
 def _draw_masks(picture: NDArray[np.uint8], predicted: NDArray[Any], true: NDArray[Any], thick: bool) -> None:
-    size = picture.shape[1::-1]
-    small = [cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA) for mask in (predicted, true)]
     # Thin lines survive the shrinking when any share of a pixel counts.
-    first, second = (mask > (40 if thick else 127) for mask in small)
-    for where, colour in ((first & second, RIGHT), (first & ~second, FALSE), (second & ~first, MISSED)):
-        opacity = 0.85 if thick else 0.5
-        picture[where] = (picture[where] * (1 - opacity) + np.array(colour) * opacity).astype(np.uint8)
+    limit, opacity = (40, 0.85) if thick else (127, 0.5)
+    first, second = (
+        _shrink(np.asarray(cv2.compare(np.asarray(mask, np.uint8), 0, cv2.CMP_GT), np.uint8), picture.shape[1::-1])
+        > limit
+        for mask in (predicted, true)
+    )
+    which = first.view(np.uint8) + 2 * second.view(np.uint8)
+    coloured = cv2.addWeighted(picture, 1 - opacity, _BY_PREDICTED_AND_TRUE[which], opacity, 0)
+    cv2.copyTo(coloured, which, picture)
 
 
 def _draw_boxes(

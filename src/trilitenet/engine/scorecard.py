@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import TASKS, Task, Thresholds
-from trilitenet.engine.overlays import error_overlay
+from trilitenet.engine.overlays import error_overlay, shrunken
 from trilitenet.engine.report import Condition, DetectionPlots, Figure, Provenance, Report, WorstFrame
 from trilitenet.engine.scoring import CanvasPrediction, FairMetrics, ImageOutcome, LabelledImage, PaperMetrics
 from trilitenet.errors import ConfigError, DataError
@@ -108,6 +108,7 @@ class Scorecard:
             "drivable": f"IoU {outcome.drivable or 0:.2f}",
             "lane": f"F1 with 2 px tolerance {outcome.lane or 0:.2f}",
         }
+        small: NDArray[np.uint8] | None = None
         for task in self.tasks:
             score: float | None = getattr(outcome, task)
             if score is None or np.isnan(score):
@@ -116,7 +117,9 @@ class Scorecard:
             badness = (1.0 - score, errors if task == "detection" else 0)
             if len(heap) >= self._keep and badness <= heap[0][:2]:
                 continue
-            picture = error_overlay(sample, prediction, task, confidence=self._confidence)
+            if small is None:
+                small = shrunken(sample.image)
+            picture = error_overlay(small, sample, prediction, task, confidence=self._confidence)
             entry = (*badness, -next(self._serial), WorstFrame(task, sample.name, score, notes[task], picture))
             if len(heap) < self._keep:
                 heapq.heappush(heap, entry)

@@ -7,7 +7,10 @@ for both, so that hard images are hard for both: a difference is real when its i
 
 from __future__ import annotations
 
+import os
+import threading
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +19,7 @@ __all__ = ["bootstrap", "draws", "interval"]
 
 FloatArray = NDArray[np.float64]
 _CHUNK = 100
+_THREADS = 2
 
 
 def draws(images: int, resamples: int, seed: int = 0) -> Iterator[NDArray[np.int32]]:
@@ -35,7 +39,7 @@ def bootstrap(
     """Compute figures on resampled images.
 
     Args:
-        figures: (R, images) weights -> name -> (R,) values.
+        figures: (R, images) weights -> name -> (R,) values; called from two threads at once.
         images: How many images there are.
         resamples: How often to resample.
         seed: The same seed gives the same draws, so that models can be compared pairwise.
@@ -43,7 +47,24 @@ def bootstrap(
     Returns:
         Name -> (resamples,) values.
     """
-    parts = [figures(weights) for weights in draws(images, resamples, seed)]
+    numbered = enumerate(draws(images, resamples, seed))
+    lock = threading.Lock()
+    done: dict[int, Mapping[str, FloatArray]] = {}
+
+    def work() -> None:
+        while True:
+            with lock:
+                number, weights = next(numbered, (0, None))
+            if weights is None:
+                return
+            done[number] = figures(weights)
+
+    # NumPy lets other threads run while it computes; a thread holds one chunk of draws at a time.
+    workers = min(_THREADS, os.cpu_count() or 1)
+    with ThreadPoolExecutor(workers, thread_name_prefix="bootstrap") as pool:
+        for future in [pool.submit(work) for _ in range(workers)]:
+            future.result()
+    parts = [done[number] for number in sorted(done)]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
 
 

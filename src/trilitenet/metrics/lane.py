@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.errors import ConfigError
+from trilitenet.errors import ConfigError, ShapeError
 from trilitenet.metrics.arithmetic import ratio, weighted_sum
 from trilitenet.metrics.rows import Rows
 from trilitenet.metrics.segmentation import (
@@ -210,13 +210,18 @@ class LaneMetric:
         Raises:
             ShapeError: If the masks are of different sizes.
         """
-        counts = self._pixels.update(prediction, truth, valid)
-        if counts is None or prediction is None or truth is None or not any(counts[:3]):
+        counts = None
+        if prediction is not None and truth is not None:
+            margin = max((1, *self.widths)) // 2 + 1
+            whole = as_binary(prediction, valid), as_binary(truth, valid)
+            pixels = whole[0].size if valid is None else int(valid.sum())
+            predicted, true = _crop_to_content(*whole, margin)
+            counts = confusion(predicted, true, pixels)
+        self._pixels.add(counts)
+        if counts is None or not any(counts[:3]):
             self._widths.append(np.zeros(4 * len(self.widths), np.int64))
             self._near.append(np.zeros(4 * (1 + len(self.tolerances)), np.int64))
             return None
-        margin = max((1, *self.widths)) // 2 + 1
-        predicted, true = _crop_to_content(as_binary(prediction, valid), as_binary(truth, valid), margin)
         centre = thin(true) if self.widths else true
         self._widths.append(
             [count for width in self.widths for count in confusion(predicted, draw_at_width(centre, width))]
@@ -300,6 +305,8 @@ def _crop_to_content(
     prediction: NDArray[np.uint8], truth: NDArray[np.uint8], margin: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Cut both masks to the rectangle that holds every foreground pixel of either, with ``margin`` pixels to spare."""
+    if prediction.shape != truth.shape:
+        raise ShapeError(f"prediction of {prediction.shape} against truth of {truth.shape}")
     left, top, width, height = cv2.boundingRect(cv2.bitwise_or(prediction, truth))
     rows = slice(max(top - margin, 0), top + height + margin)
     inside = (rows, slice(max(left - margin, 0), left + width + margin))

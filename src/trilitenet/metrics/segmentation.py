@@ -167,15 +167,18 @@ class SegmentationMetric:
             ShapeError: If the masks are of different sizes.
         """
         if prediction is None or truth is None:
-            self._counts.append((0, 0, 0, 0))
-            self._labelled.append(False)
+            self.add(None)
             return None
         counts = confusion(
             as_binary(prediction, valid), as_binary(truth, valid), None if valid is None else int(valid.sum())
         )
-        self._counts.append(counts)
-        self._labelled.append(True)
+        self.add(counts)
         return counts
+
+    def add(self, counts: tuple[int, int, int, int] | None) -> None:
+        """Add an image by its TP, FP, FN, TN; None = not labelled."""
+        self._counts.append((0, 0, 0, 0) if counts is None else counts)
+        self._labelled.append(counts is not None)
 
     @property
     def counts(self) -> NDArray[np.int64]:

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 
 from trilitenet.errors import InputError, ShapeError
 
@@ -92,10 +92,11 @@ def to_rgb(array: NDArray[Any]) -> NDArray[np.uint8]:
 def _decode(image: Image.Image, name: str) -> NDArray[np.uint8]:
     try:
         image.load()
-        image = ImageOps.exif_transpose(image)
+        if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:  # asked first, because both calls always copy
+            image = ImageOps.exif_transpose(image)
         if image.mode in {"I", "F"} or image.mode.startswith("I;16"):
             return _scale_deep(np.asarray(image))
-        return np.array(image.convert("RGB"), np.uint8)
+        return np.array(image if image.mode == "RGB" else image.convert("RGB"), np.uint8)
     except _BROKEN as error:
         raise InputError(f"{name}: is broken or truncated ({_reason(error)})") from error
 

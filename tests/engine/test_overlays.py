@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from trilitenet.data.sample import Sample
+from trilitenet.engine.overlays import FALSE, MISSED, RIGHT, error_overlay, shrunken
+from trilitenet.structures import Boxes, Perception
+
+
+def _decoded(data: bytes) -> NDArray[np.int16]:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.int16)
+
+
+def _perception(**parts: object) -> Perception:
+    return Perception(size=(720, 1280), class_names=("vehicle",), **parts)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("size", "wanted"),
+    [((720, 1280), (240, 427)), ((48, 96), (48, 96)), ((600, 500), (300, 250)), ((1, 2000), (1, 400))],
+)
+def test_images_are_shrunk_by_a_whole_number(size: tuple[int, int], wanted: tuple[int, int]) -> None:
+    assert shrunken(np.full((*size, 3), 77, np.uint8)).shape == (*wanted, 3)
+    assert (shrunken(np.full((*size, 3), 77, np.uint8)) == 77).all()
+
+
+def test_masks_are_coloured_by_what_is_right_false_and_missed() -> None:
+    black = np.zeros((720, 1280, 3), np.uint8)
+    predicted, true = np.zeros((720, 1280), np.bool_), np.zeros((720, 1280), np.uint8)
+    predicted[:, :800] = True
+    true[:, 400:1000] = 1
+    sample = Sample(name="a", image=black, drivable=true)
+    small = shrunken(black)
+    picture = _decoded(error_overlay(small, sample, _perception(drivable=predicted), "drivable", confidence=0.25))
+    assert not small.any()  # the caller's picture stays
+    for column, colour in ((60, FALSE), (200, RIGHT), (300, MISSED), (400, (0, 0, 0))):
+        np.testing.assert_allclose(picture[120, column], np.array(colour) / 2, atol=8)
+
+
+@pytest.mark.parametrize("column", range(600, 606))
+def test_a_line_two_pixels_wide_survives_the_shrinking(column: int) -> None:
+    black = np.zeros((720, 1280, 3), np.uint8)
+    true = np.zeros((720, 1280), np.uint8)
+    true[:, column : column + 2] = 1
+    sample = Sample(name="a", image=black, lane=true)
+    nothing = np.zeros((720, 1280), np.bool_)
+    picture = _decoded(error_overlay(shrunken(black), sample, _perception(lane=nothing), "lane", confidence=0.25))
+    assert picture[120, 190:210, 2].max() > 150
+
+
+def test_boxes_below_the_confidence_are_not_drawn() -> None:
+    black = np.zeros((720, 1280, 3), np.uint8)
+    box = np.array([[300, 300, 600, 600]], np.float32)
+    sample = Sample(name="a", image=black, boxes=box, class_id=np.zeros(1, np.int64))
+    for confidence, colour in ((0.5, RIGHT), (0.2, MISSED)):
+        boxes = Boxes(box, np.array([confidence], np.float32), np.zeros(1, np.int64))
+        picture = _decoded(
+            error_overlay(shrunken(black), sample, _perception(boxes=boxes), "detection", confidence=0.25)
+        )
+        np.testing.assert_allclose(picture[150, 100], colour, atol=40)
+        assert not picture[150, 120:180].any()
