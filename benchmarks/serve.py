@@ -161,32 +161,32 @@ class Server:
         command = [str(Path(sys.executable).with_name("trilitenet")), "serve", "--model", arguments.model]
         command += ["--port", str(self.port), "--backend", arguments.backend, "--log-level", "warning"]
         command += ["--max-batch", str(arguments.max_batch), "--streams", str(arguments.streams)]
-        self._process = subprocess.Popen(command)
+        self.process = subprocess.Popen(command)
         until = time.monotonic() + 120
         while True:
             try:
                 urllib.request.urlopen(f"http://127.0.0.1:{self.port}/readyz").close()
                 return
             except (urllib.error.URLError, ConnectionError):
-                if time.monotonic() > until or self._process.poll() is not None:
+                if time.monotonic() > until or self.process.poll() is not None:
                     raise
                 time.sleep(0.2)
 
     @property
     def memory(self) -> float:
         """Resident MiB."""
-        status = Path(f"/proc/{self._process.pid}/status").read_text(encoding="ascii")
+        status = Path(f"/proc/{self.process.pid}/status").read_text(encoding="ascii")
         return int(status.split("VmRSS:")[1].split()[0]) / 1024
 
     @property
     def cpu(self) -> float:
         """Seconds of processor time so far."""
-        fields = Path(f"/proc/{self._process.pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def stop(self) -> None:
-        self._process.send_signal(signal.SIGTERM)
-        self._process.wait(60)
+        self.process.send_signal(signal.SIGTERM)
+        self.process.wait(60)
 
 
 def in_process(predictor: Predictor, images: Sequence[ImageLike], batch: int, seconds: float) -> float:
