@@ -257,6 +257,21 @@ def test_a_broken_file_is_explained_and_the_page_goes_on(
     assert not page["error"].is_displayed()
 
 
+@pytest.mark.parametrize("name", ["broken.jpg", "broken.mp4"])
+def test_a_broken_file_leaves_what_was_shown_whole(page: Page, photo: Path, tmp_path: Path, name: str) -> None:
+    assert not page["timing-details"].is_displayed()
+    summary = page.see(photo)
+    assert page["timing-details"].is_displayed()
+    path = tmp_path / name
+    path.write_bytes(b"\xff\xd8\xff no picture")
+    page.choose(path)
+    page.wait(lambda: page["error"].text.endswith("."))
+    assert page["summary"].text == summary
+    (page.downloads / "road.json").unlink(missing_ok=True)
+    page["save-json"].click()
+    assert json.loads(page.downloaded("road.json").read_text())["source"] == "road"
+
+
 def test_the_keyboard_is_enough(page: Page, photo: Path) -> None:
     page.see(photo)
     page.script("document.activeElement.blur(); window.scrollTo(0, 0)")
@@ -310,6 +325,11 @@ def test_it_fits_a_phone(page: Page, photo: Path, width: int) -> None:
     )
     assert small == []
     assert _overlaps(page) == []
+    drawn, shown, letters = page.script(
+        "const v = document.getElementById('view');"
+        "return [v.width, v.clientWidth, parseFloat(v.getContext('2d').font.split(' ')[1])]"
+    )
+    assert letters * shown / drawn >= 9.9  # letters of at least 10 pixels of the page
     page.photograph(f"phone-{width}")
 
 
@@ -443,9 +463,11 @@ def test_a_token_is_asked_for_and_used(browser: Page, photo: Path) -> None:
         browser.wait(lambda: browser["token-form"].is_displayed())
         browser["token"].send_keys("a wrong one", Keys.ENTER)
         browser.wait(lambda: browser["token-form"].is_displayed() and not browser["token"].get_attribute("value"))
+        browser.wait(lambda: browser["error"].text == "The service does not take this token.")
         browser["token"].send_keys(TOKEN, Keys.ENTER)
         browser.wait(lambda: "model tiny" in browser["model"].text)
         assert not browser["token-form"].is_displayed()
+        assert not browser["error"].is_displayed()
         assert browser.see(photo).startswith("2 vehicles")
     finally:
         assert running.stop()

@@ -22,6 +22,7 @@ let fileName = "picture";
 let playing = false;
 let work = null; // AbortController of what runs now
 let retry = null; // what to do again once there is a token
+let tokenSent = false; // whether a token was given that has opened nothing yet
 
 // ---------------------------------------------------------------------------------------------- showing
 
@@ -111,6 +112,12 @@ function showError(message) {
 
 // ---------------------------------------------------------------------------------------------- working
 
+/** Say again what is shown, after a job that brought nothing new. */
+function tellCurrent() {
+  if (current) redraw();
+  else element("summary").textContent = "";
+}
+
 /** Run a job; another one stops it. Errors are shown, and a missing token is asked for. */
 async function run(job) {
   work?.abort();
@@ -122,9 +129,13 @@ async function run(job) {
   element("stop").hidden = false;
   try {
     await job(mine.signal);
+    tokenSent = false;
   } catch (error) {
+    if (work === mine) tellCurrent();
     if (error.name === "AbortError") return;
     if (error instanceof ServiceError && error.status === 401) {
+      if (tokenSent) showError("The service does not take this token.");
+      tokenSent = false;
       retry = job;
       element("token-form").hidden = false;
       element("token").focus();
@@ -143,42 +154,41 @@ async function run(job) {
 
 function openFile(file) {
   if (!file) return;
-  fileName = file.name?.replace(/\.[^.]*$/, "") || "picture";
-  run((signal) => (file.type.startsWith("video/") ? seeClip(file, signal) : seePhoto(file, signal)));
+  const name = file.name?.replace(/\.[^.]*$/, "") || "picture";
+  run((signal) => (file.type.startsWith("video/") ? seeClip(file, name, signal) : seePhoto(file, name, signal)));
 }
 
-async function seePhoto(file, signal) {
+async function seePhoto(file, name, signal) {
   element("summary").textContent = "Looking …";
   document.body.setAttribute("aria-busy", "true");
-  try {
-    const { blob, picture } = await openPhoto(file);
-    const result = await predict(blob, FLOOR, signal);
-    frames = [{ blob, result, picture: picture ?? (await createImageBitmap(blob)) }];
-    showPlayer();
-    await showFrame(0);
-  } catch (error) {
-    element("summary").textContent = "";
-    throw error;
-  }
+  const { blob, picture } = await openPhoto(file);
+  const result = await predict(blob, FLOOR, signal);
+  frames = [{ blob, result, picture: picture ?? (await createImageBitmap(blob)) }];
+  fileName = name;
+  showPlayer();
+  await showFrame(0);
 }
 
-async function seeClip(file, signal) {
-  frames = [];
-  rate = Number(element("rate").value);
+async function seeClip(file, name, signal) {
+  const wanted = Number(element("rate").value);
+  const seen = [];
   const bar = element("progress");
   element("progress-row").hidden = false;
   bar.value = 0;
   element("progress-text").textContent = "Opening the clip …";
   let chunk = [];
-  for await (const frame of openClip(file, rate, signal)) {
+  for await (const frame of openClip(file, wanted, signal)) {
     chunk.push(frame);
     if (chunk.length < CHUNK && frame.index < frame.count - 1) continue;
     const results = await predictBatch(chunk.map((one) => one.blob), FLOOR, signal);
     for (const [index, one] of chunk.entries()) {
       one.picture.close();
-      frames.push({ blob: one.blob, time: one.time, result: results[index] });
+      seen.push({ blob: one.blob, time: one.time, result: results[index] });
     }
     chunk = [];
+    frames = seen; // only now: until its first frames are seen, what was shown before stays whole
+    fileName = name;
+    rate = wanted;
     bar.value = frames.length / frame.count;
     element("progress-text").textContent = `Frame ${frames.length} of ${frame.count}`;
     showPlayer();
@@ -188,11 +198,11 @@ async function seeClip(file, signal) {
 }
 
 async function seeCamera(signal) {
-  fileName = "camera";
   for await (const { blob, picture } of openCamera(signal)) {
     const result = await predict(blob, FLOOR, signal);
     frames[0]?.picture?.close?.();
     frames = [{ blob, result, picture }];
+    fileName = "camera";
     showPlayer();
     await showFrame(0, false);
   }
@@ -281,10 +291,12 @@ element("save-clip").addEventListener("click", saveClip);
 element("token-form").addEventListener("submit", (event) => {
   event.preventDefault();
   setToken(element("token").value.trim());
+  tokenSent = true;
   element("token").value = "";
   element("token-form").hidden = true;
   if (retry) run(retry);
 });
+window.addEventListener("resize", () => redraw(false)); // letters and lines stay readable
 document.addEventListener("dragover", (event) => {
   event.preventDefault();
   document.body.classList.add("over");
@@ -301,7 +313,8 @@ document.addEventListener("paste", (event) => openFile(event.clipboardData.files
 
 run(async () => {
   const model = await getModel();
-  element("model").textContent = `${model.card.tasks.length === 3 ? "Vehicles, drivable area and lane markings" : model.card.tasks.join(", ")} · model ${model.name} on ${model.backend}`;
+  if (model.card.tasks.length < 3) element("tasks").textContent = model.card.tasks.join(", ");
+  element("model").textContent = `model ${model.name} on ${model.backend}`;
   element("confidence").value = model.card.thresholds.confidence;
   readControls();
 });

@@ -30,9 +30,13 @@ async function ask(path, options = {}) {
   } catch {
     // not one of the service's own answers: the status says it all
   }
-  const error = new ServiceError(answer.status, message.charAt(0).toUpperCase() + message.slice(1));
+  const error = new ServiceError(answer.status, sentence(message));
   error.wait = Number(answer.headers.get("retry-after")) || 1;
   throw error;
+}
+
+function sentence(text) {
+  return `${text.charAt(0).toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
 }
 
 async function patiently(path, options) {
@@ -81,7 +85,7 @@ export async function predictBatch(blobs, floor, signal) {
   const { results } = await patiently(`v1/predict/batch?confidence=${floor}`, { method: "POST", body: form, signal });
   const roundTrip = (performance.now() - started) / blobs.length;
   return results.map((result) => {
-    if (result.status !== 200) throw new ServiceError(result.status, result.error.message);
+    if (result.status !== 200) throw new ServiceError(result.status, sentence(result.error.message));
     return { ...result, roundTrip };
   });
 }

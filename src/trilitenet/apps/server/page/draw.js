@@ -90,10 +90,11 @@ export function drawFrame(view, frame, options) {
 function drawBox(context, box, view) {
   const [left, top, right, bottom] = box.xyxy;
   const longest = Math.max(view.width, view.height);
-  const size = Math.max(11, longest / 64);
+  const shrunk = view.width / (view.clientWidth || view.width); // pixels of the picture to one of the page
+  const size = Math.max(11, longest / 64, 10 * shrunk);
   context.strokeStyle = BOX_COLOURS[box.class_id % BOX_COLOURS.length];
   context.fillStyle = context.strokeStyle;
-  context.lineWidth = Math.max(1.5, longest / 450);
+  context.lineWidth = Math.max(1.5, longest / 450, 1.25 * shrunk);
   context.strokeRect(left, top, right - left, bottom - top);
   context.font = `600 ${size}px system-ui, sans-serif`;
   const text = `${box.class_name} ${box.confidence.toFixed(2)}`;
