@@ -9,7 +9,9 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import functools
+import io
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,6 +20,7 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from trilitenet import __version__
 from trilitenet.apps.server.batching import Admission, Batcher
@@ -105,11 +108,13 @@ class Service:
         return not self._warm or self._batcher.alive
 
     async def start(self) -> None:
-        """Start the threads and run the network once, so that the first request is not slow."""
+        """Start the threads and take one grey image the whole way, so that the first request is not slow."""
         self._batcher.start()
         height, width = self.card.input_size
-        canvas, _ = self.predictor.preprocess(np.full((height, width, 3), 114, np.uint8))
-        await asyncio.wrap_future(self._batcher.submit(canvas, deadline=float("inf")))
+        file = io.BytesIO()
+        Image.new("RGB", (width, height), (114, 114, 114)).save(file, "JPEG")
+        image = Encoded(file.getvalue(), Header("JPEG", width, height, 1))
+        await self._stages(image, math.inf, lambda outcome: outcome.perception.to_dict(), self.predictor, False)
         self._warm = True
 
     async def stop(self) -> None:
