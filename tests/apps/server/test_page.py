@@ -209,6 +209,27 @@ def test_toggles_and_opacity_draw_again(page: Page, photo: Path) -> None:
     np.testing.assert_allclose(page.pixel(*edge), page.pixel(0.05, edge[1]), atol=2)
 
 
+def test_labels_do_not_hide_each_other(page: Page) -> None:
+    boxes = [
+        {"xyxy": [100, 100, 300, 200], "confidence": 0.9, "class_id": 0, "class_name": "vehicle"},
+        {"xyxy": [105, 102, 200, 190], "confidence": 0.8, "class_id": 0, "class_name": "vehicle"},
+        {"xyxy": [60, 101, 120, 190], "confidence": 0.7, "class_id": 0, "class_name": "vehicle"},
+        {"xyxy": [100, 300, 300, 350], "confidence": 0.6, "class_id": 0, "class_name": "vehicle"},
+        {"xyxy": [102, 102, 198, 188], "confidence": 0.5, "class_id": 0, "class_name": "vehicle"},
+    ]
+    said = page.script(
+        "const { drawFrame } = await import('/draw.js'); const said = [];"
+        "const view = document.createElement('canvas'); const write = CanvasRenderingContext2D.prototype.fillText;"
+        "CanvasRenderingContext2D.prototype.fillText = function (text) { said.push(text); };"
+        "const picture = await createImageBitmap(new ImageData(640, 360)); const show = { show: true, opacity: 1 };"
+        "drawFrame(view, { picture, boxes: arguments[0] },"
+        "  { detection: show, drivable: show, lane: show, confidence: 0 });"
+        "CanvasRenderingContext2D.prototype.fillText = write; return said",
+        boxes,
+    )
+    assert said == ["vehicle 0.90", "0.80", "0.70", "vehicle 0.60"]
+
+
 def test_the_slider_chooses_boxes(page: Page, photo: Path) -> None:
     page.see(photo)
     counts = {}

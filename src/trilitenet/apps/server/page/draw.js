@@ -82,27 +82,47 @@ export function drawFrame(view, frame, options) {
   }
   if (options.detection.show) {
     context.globalAlpha = options.detection.opacity;
-    for (const box of shownBoxes(frame, options).reverse()) drawBox(context, box, view);
+    drawBoxes(context, shownBoxes(frame, options), view);
   }
   context.globalAlpha = 1;
 }
 
-function drawBox(context, box, view) {
-  const [left, top, right, bottom] = box.xyxy;
+/** Draw boxes, the most confident first, and their labels; a label that would hide one before it says less or nothing. */
+function drawBoxes(context, boxes, view) {
   const longest = Math.max(view.width, view.height);
   const shrunk = view.width / (view.clientWidth || view.width); // pixels of the picture to one of the page
   const size = Math.max(11, longest / 64, 10 * shrunk);
-  context.strokeStyle = BOX_COLOURS[box.class_id % BOX_COLOURS.length];
-  context.fillStyle = context.strokeStyle;
+  const colour = (box) => BOX_COLOURS[box.class_id % BOX_COLOURS.length];
   context.lineWidth = Math.max(1.5, longest / 450, 1.25 * shrunk);
-  context.strokeRect(left, top, right - left, bottom - top);
+  for (const box of [...boxes].reverse()) {
+    const [left, top, right, bottom] = box.xyxy;
+    context.strokeStyle = colour(box);
+    context.strokeRect(left, top, right - left, bottom - top);
+  }
   context.font = `600 ${size}px system-ui, sans-serif`;
-  const text = `${box.class_name} ${box.confidence.toFixed(2)}`;
-  const width = context.measureText(text).width + size * 0.6;
-  const x = Math.min(Math.max(0, left - context.lineWidth / 2), view.width - width);
-  const y = top >= size * 1.4 ? top - size * 1.4 : top;
-  context.fillRect(x, y, width, size * 1.4);
-  context.fillStyle = "#000";
   context.textBaseline = "middle";
-  context.fillText(text, x + size * 0.3, y + size * 0.72);
+  const height = size * 1.4;
+  const labels = [];
+  for (const box of boxes) {
+    const [left, top, , bottom] = box.xyxy;
+    const above = top >= height ? top - height : top;
+    const confidence = box.confidence.toFixed(2);
+    for (const [text, y] of [
+      [`${box.class_name} ${confidence}`, above],
+      [confidence, above],
+      [confidence, Math.min(bottom, view.height - height)],
+    ]) {
+      const width = context.measureText(text).width + size * 0.6;
+      const x = Math.min(Math.max(0, left - context.lineWidth / 2), view.width - width);
+      const hides = (label) =>
+        x < label.x + label.width && label.x < x + width && y < label.y + height && label.y < y + height;
+      if (labels.some(hides)) continue;
+      labels.push({ x, y, width });
+      context.fillStyle = colour(box);
+      context.fillRect(x, y, width, height);
+      context.fillStyle = "#000";
+      context.fillText(text, x + size * 0.3, y + size * 0.72);
+      break;
+    }
+  }
 }
