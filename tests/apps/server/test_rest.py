@@ -169,6 +169,13 @@ def test_a_backend_that_fails_is_an_answer_not_an_end(client: TestClient, jpeg: 
     assert client.post("/v1/predict", content=jpeg).status_code == 200
 
 
+def test_one_image_goes_the_whole_way_before_the_service_is_ready(client: TestClient) -> None:
+    text = client.get("/metrics").text
+    for stage in ("decode", "preprocess", "network", "postprocess", "encode"):
+        assert f'trilitenet_stage_seconds_count{{stage="{stage}"}} 1.0' in text
+    assert "trilitenet_ready 1.0" in text
+
+
 def test_metrics_count_what_happened(client: TestClient, jpeg: bytes) -> None:
     client.post("/v1/predict", content=jpeg)
     client.post("/v1/predict", content=b"no image")
