@@ -2,8 +2,9 @@
 
     python benchmarks/gpu.py --variant tiny small base --batch 1 8 32
 
-Prepared for a machine with a GPU; its figures have not been measured (docs/speed.md says so). Without CUDA it says
-that in one line and exits 1.
+Pixels lie on the device already; copies to and from it are not timed. Each way runs for a quarter of a second at a
+time, so that the meter of the board's energy, which moves every few tens of milliseconds, can follow. Without CUDA it
+says so in one line and exits 1.
 """
 
 from __future__ import annotations
@@ -16,36 +17,47 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from torch import nn
 
 from trilitenet.deploy.graph import DeployGraph
 from trilitenet.deploy.layouts import LAYOUTS
 from trilitenet.models.trilitenet import TriLiteNet, build_network, normalise_images
 
+SIZE = (384, 640)
+
 
 def eager_amp(network: TriLiteNet, batch: int) -> Callable[[], object]:
-    images = torch.randint(0, 256, (batch, 3, 384, 640), dtype=torch.uint8, device="cuda")
+    images = torch.randint(0, 256, (batch, 3, *SIZE), dtype=torch.uint8, device="cuda")
 
     def call() -> None:
         with torch.inference_mode(), torch.autocast("cuda", torch.float16):
             outputs = network(normalise_images(images))
             network.decode(outputs)
             for logits in (outputs.drivable, outputs.lane):
+                assert logits is not None
                 logits.argmax(1)
 
     return call
 
 
 def deploy_graphed(network: TriLiteNet, batch: int, layout: str) -> Callable[[], object]:
-    """Return the deploy graph in fp16, captured once and replayed: no launch is paid for twice.
+    """Return the deploy graph in fp16 (boxes decoded in fp32), captured once and replayed.
 
-    Decoding stays in fp32: sides of boxes do not survive ten bits.
+    Args:
+        network: What to run.
+        batch: Images a call.
+        layout: A name of `LAYOUTS`; with ``:nhwc`` its convolutions' weights are channels-last.
     """
-    graph = DeployGraph(network, LAYOUTS[layout]).cuda().eval()
-    images = torch.randint(0, 256, (batch, 384, 640, 3), dtype=torch.uint8, device="cuda")
+    name, _, memory = layout.partition(":")
+    graph: nn.Module = DeployGraph(network, LAYOUTS[name]).reduced(torch.float16).cuda()
+    if memory:
+        graph = graph.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    images = torch.randint(0, 256, (batch, *SIZE, 3), dtype=torch.uint8, device="cuda")
     side = torch.cuda.Stream()
-    with torch.inference_mode(), torch.autocast("cuda", torch.float16):
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.inference_mode():
         with torch.cuda.stream(side):
-            for _ in range(5):
+            for _ in range(3):
                 graph(images)
         torch.cuda.current_stream().wait_stream(side)
         captured = torch.cuda.CUDAGraph()
@@ -77,39 +89,43 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--variant", nargs="+", default=["tiny", "small", "base"])
     parser.add_argument("--batch", nargs="+", type=int, default=[1, 8, 32])
-    parser.add_argument("--layout", default="planar", choices=list(LAYOUTS))
-    parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--layouts", nargs="+", default=["planar"], help="names of LAYOUTS, with or without :nhwc")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=0.25)
     arguments = parser.parse_args()
     if not torch.cuda.is_available():
         print("error: no CUDA device here", file=sys.stderr)
         return 1
     joules = energy()
-    print(torch.cuda.get_device_name())
+    print(f"{torch.cuda.get_device_name()}, PyTorch {torch.__version__}, {SIZE[1]}x{SIZE[0]}", flush=True)
+    print("| variant | batch | way | frames/s | ratio | J/frame | W |\n|---|---|---|---|---|---|---|")
     for variant in arguments.variant:
         torch.manual_seed(0)
         network = build_network(variant).eval().cuda()
         for batch in arguments.batch:
-            calls = {
-                "plain eager AMP": eager_amp(network, batch),
-                "deploy fp16, CUDA graph": deploy_graphed(build_network(variant).eval(), batch, arguments.layout),
-            }
-            for call in calls.values():
-                timed(call, 5)
+            calls = {"plain eager AMP": eager_amp(network, batch)}
+            for layout in arguments.layouts:
+                fresh = build_network(variant).eval()
+                calls[f"deploy fp16, CUDA graph, {layout}"] = deploy_graphed(fresh, batch, layout)
+            counts = {}
+            for name, call in calls.items():
+                timed(call, 3)
+                counts[name] = max(1, round(arguments.seconds / timed(call, 5)))
             times: dict[str, list[float]] = {name: [] for name in calls}
             spent: dict[str, list[float]] = {name: [] for name in calls}
             for _ in range(arguments.rounds):
                 for name, call in calls.items():
-                    before = joules() if joules else 0.0
-                    times[name].append(timed(call, 20))
-                    spent[name].append(((joules() - before) if joules else float("nan")) / 20 / batch)
+                    before = joules() if joules else float("nan")
+                    times[name].append(timed(call, counts[name]))
+                    after = joules() if joules else float("nan")
+                    spent[name].append((after - before) / counts[name] / batch)
             plain = np.array(times["plain eager AMP"])
             for name, values in times.items():
-                seconds = statistics.median(values)
+                seconds, used = statistics.median(values), statistics.median(spent[name])
                 print(
-                    f"{variant} batch {batch} {name}: {batch / seconds:.0f} frames/s, "
-                    f"{statistics.median(spent[name]):.4f} J/frame, "
-                    f"{statistics.median(spent[name]) * batch / seconds:.0f} W, "
-                    f"ratio {np.median(plain / np.array(values)):.2f}"
+                    f"| {variant} | {batch} | {name} | {batch / seconds:.0f} "
+                    f"| {float(np.median(plain / np.array(values))):.2f} | {used:.4f} | {used * batch / seconds:.0f} |",
+                    flush=True,
                 )
     return 0
 

@@ -7,9 +7,15 @@ import pytest
 import torch
 
 from trilitenet.config import VARIANTS
+from trilitenet.data.batches import collate
+from trilitenet.data.synthetic import SyntheticScenes
+from trilitenet.data.transforms import EvalTransform
+from trilitenet.losses.detection import DetectionLoss
+from trilitenet.losses.multitask import MultiTaskLoss
 from trilitenet.models.attention import merge_bins, split_bins
-from trilitenet.models.blocks import DepthwiseConv, DepthwiseESP, StrideESP
+from trilitenet.models.blocks import DepthwiseESP, DilatedConv, StrideESP
 from trilitenet.models.encoder import Encoder
+from trilitenet.models.trilitenet import build_network, normalise_images
 
 
 def test_split_bins_inverts_and_keeps_bins_apart() -> None:
@@ -54,13 +60,15 @@ def test_pooled_images_count_the_zeros_of_the_padding() -> None:
     assert outputs.i1[0, 0, 1, 1] == pytest.approx(1)
 
 
-@pytest.mark.parametrize("dilation", [2, 4, 8, 16])
-def test_dilated_depthwise_gradient_under_bf16_autocast(dilation: int) -> None:
+@pytest.mark.parametrize("dilation", [1, 2, 4, 8, 16])
+@pytest.mark.parametrize(("channels", "groups"), [(6, 6), (25, 1), (26, 1), (12, 1)])
+def test_dilated_gradient_under_bf16_autocast(channels: int, groups: int, dilation: int) -> None:
     """PyTorch 2.13.0 on CPU gives a wrong weight gradient for bf16, channels-last and dilation; ours must not."""
     torch.manual_seed(0)
-    conv = DepthwiseConv(6, 3, dilation=dilation).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    x = torch.randn(2, 6, 48, 80).to(memory_format=torch.channels_last)
-    target = torch.randn(2, 6, 48, 80)
+    conv = DilatedConv(channels, channels, 3, dilation=dilation, groups=groups)
+    conv = conv.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    x = torch.randn(2, channels, 48, 80).to(memory_format=torch.channels_last)
+    target = torch.randn(2, channels, 48, 80)
     conv(x).mul(target).sum().backward()
     assert conv.weight.grad is not None
     expected = conv.weight.grad.clone()
@@ -71,3 +79,27 @@ def test_dilated_depthwise_gradient_under_bf16_autocast(dilation: int) -> None:
     error = (conv.weight.grad - expected).norm() / expected.norm()
     assert np.isfinite(error.item())
     assert error < 0.02
+
+
+@pytest.mark.parametrize("variant", list(VARIANTS))
+def test_bf16_gradient_of_the_network_is_no_worse_in_channels_last(variant: str) -> None:
+    """Beside fp32 both layouts differ by bf16's own rounding; what PyTorch gets wrong in one would stand out."""
+    transform = EvalTransform((96, 160))
+    batch = collate([transform(scene) for scene in (SyntheticScenes(0)[0], SyntheticScenes(0)[1])])
+    errors, gradients = [], []
+    for layout, enabled in (
+        (torch.contiguous_format, False),
+        (torch.contiguous_format, True),
+        (torch.channels_last, True),
+    ):
+        torch.manual_seed(0)
+        network = build_network(variant).to(memory_format=layout).train()  # type: ignore[call-overload]
+        loss = MultiTaskLoss(DetectionLoss(network.anchors, 1))
+        with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+            outputs = network(normalise_images(batch.images.contiguous(memory_format=layout)))
+        loss(outputs, batch).total.backward()
+        gradients.append(torch.cat([p.grad.flatten() for p in network.parameters() if p.grad is not None]))
+        errors.append(((gradients[-1] - gradients[0]).norm() / gradients[0].norm()).item())
+    assert np.isfinite(errors).all()
+    assert errors[1] < 0.3
+    assert errors[2] < 1.5 * errors[1]

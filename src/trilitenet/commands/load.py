@@ -37,7 +37,9 @@ def load(
     Args:
         model: Name of shipped weights, a file of weights, or an exported artefact (.onnx, .xml, .engine, .pt2).
         device: auto (the best there is), cpu, cuda, cuda:1, mps.
-        backend: auto (the fastest present that runs the file), torch, onnxruntime, openvino or tensorrt.
+        backend: auto (the fastest present that runs the file), torch, onnxruntime, openvino or tensorrt. A file of
+            weights runs on PyTorch: on CUDA, auto is its deploy graph in fp16 under CUDA graphs, torch the plain
+            network in fp32.
         confidence: Keep boxes whose confidence is above this, in [0, 1]; the model's own if left out.
         iou: A box goes when it overlaps a better one by more, in [0, 1]; the model's own if left out.
         drivable: A pixel is drivable above this probability, in [0, 1]; the model's own if left out.
@@ -64,7 +66,7 @@ def load(
 
 def _open(model: str | os.PathLike[str], device: str, backend: str, streams: int, threads: int | None) -> Backend:
     """Open a file on the runtime asked for, or on the fastest one here that runs it."""
-    suffix = Path(model).suffix.lower()
+    suffix, fastest = Path(model).suffix.lower(), backend == "auto"
     runs = {".onnx": ("openvino", "onnxruntime"), ".xml": ("openvino",), ".engine": ("tensorrt",)}.get(
         suffix, ("torch",)
     )
@@ -99,14 +101,25 @@ def _open(model: str | os.PathLike[str], device: str, backend: str, streams: int
         from trilitenet.inference.exported_torch_backend import ExportedTorchBackend
 
         return ExportedTorchBackend(model, device)
-    return _open_torch(model, device)
+    return _open_torch(model, device, fastest=fastest)
 
 
-def _open_torch(model: str | os.PathLike[str], device: str) -> Backend:
-    from trilitenet.inference.torch_backend import TorchBackend
+def _open_torch(model: str | os.PathLike[str], device: str, *, fastest: bool) -> Backend:
+    from trilitenet.inference.torch_backend import TorchBackend, pick_device
     from trilitenet.models.weights import load_network
 
-    return TorchBackend(load_network(model), device)
+    network = load_network(model)
+    if fastest and pick_device(device).type == "cuda":
+        import torch
+
+        from trilitenet.deploy.graph import DeployGraph
+        from trilitenet.deploy.layouts import pick_layout
+        from trilitenet.inference.cuda_graph_backend import CudaGraphBackend
+
+        layout = pick_layout("auto", network.variant, "torch", amx=False)
+        graph = DeployGraph(network, layout, masks="probability").reduced(torch.float16)
+        return CudaGraphBackend(graph, network.card, str(pick_device(device)))
+    return TorchBackend(network, device)
 
 
 def _override(card: ModelCard, **given: float | None) -> Thresholds:

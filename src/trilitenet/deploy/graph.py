@@ -54,6 +54,7 @@ __all__ = ["MASKS", "DeployGraph", "DeployOutputs", "Masks"]
 Masks = Literal["decision", "probability", "logit"]
 """What a mask holds: 0 or 1, probability x 255, or foreground minus background logit minus the threshold's."""
 MASKS: Final[tuple[Masks, ...]] = ("decision", "probability", "logit")
+REDUCED: Final = (torch.float16, torch.bfloat16)
 
 
 class DeployOutputs(NamedTuple):
@@ -195,7 +196,9 @@ class DetectionGraph(nn.Module):
     def decode(self, level: int, logits: Tensor) -> Tensor:
         """Decode one level: (B, anchors x values, h, w) -> (B, h x w x anchors, values)."""
         batch, _, height, width = logits.shape
-        scores = torch.sigmoid(logits.permute(0, 2, 3, 1))
+        logits = logits.permute(0, 2, 3, 1)
+        # Sides and centres of boxes do not survive the ten bits of half precision.
+        scores = torch.sigmoid(logits.float() if logits.dtype in REDUCED else logits)
         columns = torch.arange(width, dtype=torch.float32, device=logits.device) - 0.5
         rows = torch.arange(height, dtype=torch.float32, device=logits.device) - 0.5
         offset = columns.view(1, width, 1) * self.step[0, level] + rows.view(height, 1, 1) * self.step[1, level]
@@ -464,11 +467,35 @@ class DeployGraph(nn.Module):
                 lane = self.lane(attended, i1, i2)
         return DeployOutputs(detection, drivable, lane)
 
+    def reduced(self, dtype: torch.dtype) -> DeployGraph:
+        """Compute in half precision from here on, all but pixels and the decoding of boxes; return the graph itself.
+
+        Args:
+            dtype: torch.float16 or torch.bfloat16.
+
+        Raises:
+            ConfigError: If it is another.
+        """
+        if dtype not in REDUCED:
+            raise ConfigError(f"the deploy graph is reduced to float16 or bfloat16, not {dtype}")
+        kept = {id(self.scale), id(self.shift)}
+        if self.detection is not None:
+            kept |= {id(self.detection.square), id(self.detection.linear), id(self.detection.step)}
+        for parameter in self.parameters():
+            if id(parameter) not in kept:
+                parameter.data = parameter.data.to(dtype)
+        return self
+
     def normalise(self, image: Tensor) -> Tensor:
         """Return pixels as a normalised map, in blocks where the layout is channels-last.
 
         Scale and shift act on rows flattened to (B, rows, columns x 3), which is one pass over contiguous memory.
         """
+        x = self._normalise(image)
+        dtype = self.stem.weight.dtype
+        return x.to(dtype) if dtype in REDUCED else x
+
+    def _normalise(self, image: Tensor) -> Tensor:
         if image.ndim == 4 and image.shape[1] == 3 and image.is_floating_point() and not self.layout.channels_last:
             return image * self.scale.view(1, 3, 1, 1) + self.shift.view(1, 3, 1, 1)
         if image.ndim != 4 or image.shape[3] != 3:

@@ -75,31 +75,37 @@ class TransposedConvBNPReLU(nn.Module):
         return out
 
 
-class DepthwiseConv(nn.Conv2d):
-    """k x k depthwise convolution without bias, size-keeping padding for stride 1.
+def _is_bf16_on_cpu(x: Tensor) -> bool:
+    return x.device.type == "cpu" and torch.is_autocast_enabled("cpu")
 
-    Under bf16 autocast on a CPU, a dilated one runs in fp32: with channels-last input PyTorch (2.13.0) computes a
-    wrong weight gradient for it in bf16.
+
+class DilatedConv(nn.Conv2d):
+    """k x k convolution without bias, size-keeping padding for stride 1, with a dilation.
+
+    Under bf16 autocast on a CPU, a dilated one runs in fp32 where PyTorch (2.13.0) computes a wrong weight gradient for
+    it from channels-last input in bf16: a depthwise one everywhere, a dense one on processors without matrix tiles
+    (AMX), which may even crash.
     """
 
-    def __init__(self, channels: int, kernel: int, stride: int = 1, dilation: int = 1) -> None:
-        super().__init__(
-            channels,
-            channels,
-            kernel,
-            stride,
-            padding=(kernel // 2) * dilation,
-            dilation=dilation,
-            groups=channels,
-            bias=False,
-        )
+    def __init__(
+        self, in_channels: int, out_channels: int, kernel: int, stride: int = 1, dilation: int = 1, groups: int = 1
+    ) -> None:
+        padding = (kernel // 2) * dilation
+        super().__init__(in_channels, out_channels, kernel, stride, padding, dilation, groups, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the convolution."""
-        if self.dilation[0] > 1 and x.device.type == "cpu" and torch.is_autocast_enabled("cpu"):
+        if self.dilation[0] > 1 and _is_bf16_on_cpu(x) and (self.groups > 1 or not torch.cpu._is_amx_tile_supported()):
             with torch.autocast("cpu", enabled=False):
                 return super().forward(x.float()).to(x.dtype)
         return super().forward(x)
+
+
+class DepthwiseConv(DilatedConv):
+    """A `DilatedConv` of one group a channel."""
+
+    def __init__(self, channels: int, kernel: int, stride: int = 1, dilation: int = 1) -> None:
+        super().__init__(channels, channels, kernel, stride, dilation, groups=channels)
 
 
 class DepthwiseSeparableConv(nn.Module):
@@ -142,9 +148,7 @@ class StrideESP(nn.Module):
         branch, first = _split(out_channels)
         self.reduce = nn.Conv2d(in_channels, branch, 3, 2, padding=1, bias=False)
         self.d1 = nn.Conv2d(branch, first, 3, padding=1, bias=False)
-        self.d2, self.d4, self.d8, self.d16 = (
-            nn.Conv2d(branch, branch, 3, padding=d, dilation=d, bias=False) for d in DILATIONS
-        )
+        self.d2, self.d4, self.d8, self.d16 = (DilatedConv(branch, branch, 3, dilation=d) for d in DILATIONS)
         self.bn = batch_norm(out_channels)
         self.act = PReLU(out_channels)
 
