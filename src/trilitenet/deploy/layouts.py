@@ -28,7 +28,7 @@ def pick_layout(name: str, variant: str, runtime: str, *, amx: bool) -> Layout:
     Args:
         name: A key of `LAYOUTS`, or ``"auto"``.
         variant: ``"tiny"``, ``"small"`` or ``"base"``.
-        runtime: ``"openvino"``, ``"onnxruntime"``, or another, which gets the planar one.
+        runtime: ``"openvino"``, ``"onnxruntime"``, ``"cuda"`` (PyTorch), or another, which gets the planar one.
         amx: Whether the processor has matrix tiles. They make the 4-fold arithmetic of blocks free; without them only
             tiny, whose heads have fewer channels than a vector has lanes, gains from blocks.
 
@@ -41,6 +41,8 @@ def pick_layout(name: str, variant: str, runtime: str, *, amx: bool) -> Layout:
         return LAYOUTS[name]
     if runtime == "onnxruntime":
         return LAYOUTS["planar-maximum-split" if variant == "base" else "planar-maximum-heads"]
+    if runtime == "cuda":
+        return LAYOUTS["pixels"]
     if runtime != "openvino":
         return LAYOUTS["planar"]
     if amx:
