@@ -6,6 +6,7 @@ python benchmarks/road.py --calibrate              # no camera file: the camera 
 python benchmarks/road.py --clip docs/images/drive.webp   # a short animated overlay
 python benchmarks/road.py --render drive           # drive/drive.mp4, camera.yaml and truth.json, and the figures
 python benchmarks/road.py --results results/drive.json --truth drive/truth.json   # what `trilitenet predict` made of it
+python benchmarks/road.py --lanes 100              # time of lanes as curves at 640x384; with --model its masks too
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from trilitenet.data.synthetic import Scene, SceneTruth
+from trilitenet.data.synthetic import Scene, SceneTruth, SyntheticScenes
 from trilitenet.data.synthetic_drive import SyntheticDrive
 from trilitenet.inference.video import VideoWriter
 from trilitenet.processing.drawing import draw
 from trilitenet.road.camera import write_camera
 from trilitenet.road.drawing import draw_road
+from trilitenet.road.lanes import find_lines
 from trilitenet.road.monitor import RoadMonitor
 from trilitenet.road.tracking import Steady
 from trilitenet.structures import Boxes, Perception
@@ -90,13 +92,15 @@ class Errors:
     def show(self) -> None:
         """Print a table."""
         units = {"offset": ("m", 1), "heading": ("rad", 1), "curvature": ("1/m", 1), "lead": ("%", 100)}
-        print(f"{'':10} {'frames':>7} {'mean':>9} {'median':>9} {'95%':>9} {'max':>9}")
+        print(f"{'':10} {'frames':>7} {'share':>6} {'mean':>9} {'median':>9} {'95%':>9} {'max':>9}")
         for name, (unit, gain) in units.items():
             values = np.array(self.values.get(name, [np.nan])) * gain
             figures = " ".join(
                 f"{v:9.4f}" for v in (values.mean(), np.median(values), np.quantile(values, 0.95), values.max())
             )
-            print(f"{name:10} {len(values):7d} {figures} {unit}")
+            count = len(self.values.get(name, []))
+            share = count / max(1, self.led if name == "lead" else self.frames)
+            print(f"{name:10} {count:7d} {share:6.1%} {figures} {unit}")
         print(f"lead found in {self.found} of {self.led} frames with one up to 40 m; {self.frames} frames")
 
 
@@ -107,6 +111,31 @@ def compare(results: Path, truth: Path) -> None:
     for frame in json.loads(results.read_text(encoding="utf-8"))["frames"]:
         errors.add(truths[frame["frame"]], frame["road"])
     errors.show()
+
+
+def time_lanes(scenes: int, model: str | None) -> None:
+    """Print how long the curves of a 640x384 lane mask take, on one thread, each mask once."""
+    drawn = [SyntheticScenes(21, (384, 640))[index] for index in range(scenes)]
+    masks = {"true": [scene.lane > 0 for scene in drawn if scene.lane is not None]}
+    if model:
+        import trilitenet
+
+        predictor = trilitenet.load(model)
+        seen = [predictor(scene.image) for scene in drawn]
+        masks[model] = [one.lane for one in seen if isinstance(one, Perception) and one.lane is not None]
+    cv2.setNumThreads(1)
+    for name, kept in masks.items():
+        find_lines(kept[0])
+        wall, busy, lines = [], [], 0
+        for mask in kept:
+            begin, worked = time.perf_counter(), time.thread_time()
+            lines += len(find_lines(mask))
+            busy.append((time.thread_time() - worked) * 1e3)
+            wall.append((time.perf_counter() - begin) * 1e3)
+        print(f"{name} masks: {len(kept)} at 640x384, {lines / len(kept):.1f} lines each")
+        for what, spent in (("wall", wall), ("processor", busy)):
+            p50, p99 = np.quantile(spent, (0.5, 0.99))
+            print(f"  {what:9} time: p50 {p50:.2f}, p99 {p99:.2f}, max {max(spent):.2f} ms")
 
 
 def main() -> None:
@@ -123,7 +152,11 @@ def main() -> None:
     parser.add_argument("--render", type=Path, help="write the drive to this folder: video, camera file, truth")
     parser.add_argument("--results", type=Path, help="compare JSON of `trilitenet predict --road` with --truth")
     parser.add_argument("--truth", type=Path, help="truth.json of --render")
+    parser.add_argument("--lanes", type=int, metavar="SCENES", help="only time lanes as curves, on so many scenes")
     options = parser.parse_args()
+    if options.lanes:
+        time_lanes(options.lanes, options.model)
+        return
     if options.results:
         if options.truth is None:
             parser.error("--results needs --truth")

@@ -2,6 +2,7 @@
 
     python benchmarks/video.py VIDEO --model tiny --device cpu
     python benchmarks/video.py VIDEO --model tiny.xml --camera camera.yaml     # and the road in metres, with tracks
+    python benchmarks/video.py VIDEO --long-side 320 --memory 10000     # resident memory over 10,000 frames, only
 
 Runs of pure inference and of the pipeline take turns in one process, so that a busy machine slows both; the ratio is
 the median over the rounds. Then each stage alone, in processor time a frame, tells what bounds the pipeline.
@@ -10,6 +11,7 @@ the median over the rounds. Then each stage alone, in processor time a frame, te
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import os
 import platform
@@ -19,6 +21,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import av
 import numpy as np
 
 import trilitenet
@@ -99,6 +102,59 @@ def stages(predictor: Predictor, video: Path, frames: int, options: RoadOptions)
     return taken
 
 
+def repeat(video: Path, target: Path, frames: int) -> None:
+    """Write a video again and again into one file, without encoding it anew, until it has so many frames."""
+    written, shift = 0, 0
+    with av.open(str(target), "w") as out:
+        stream = None
+        while written < frames:
+            with av.open(str(video)) as source:
+                if stream is None:
+                    stream = out.add_stream_from_template(source.streams.video[0])
+                packets = [packet for packet in source.demux(video=0) if packet.pts is not None]
+                for packet in packets:
+                    packet.pts += shift
+                    packet.dts = packet.dts + shift if packet.dts is not None else None
+                    packet.stream = stream
+                shift = max(packet.pts + (packet.duration or 1) for packet in packets)
+                for packet in packets:
+                    out.mux(packet)
+                written += len(packets)
+
+
+def resident() -> float:
+    """Return the process's resident memory in MB (Linux)."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def memory(predictor: Predictor, video: Path, frames: int, overlay: bool, road: RoadOptions) -> None:
+    """Print resident memory along a long run from file to file: every tenth of it, and at the end."""
+    run, seen, told, marks = predictor.backend.run, 0, 0, []
+
+    def counted(batch: np.ndarray) -> RawOutputs:
+        nonlocal seen, told
+        seen += len(batch)
+        if seen * 10 // frames > told:
+            told = seen * 10 // frames
+            gc.collect()
+            marks.append(resident())
+            print(f"{seen:7d} frames: {marks[-1]:7.1f} MB resident", flush=True)
+        return run(batch)
+
+    predictor.backend.run = counted  # type: ignore[method-assign]
+    with tempfile.TemporaryDirectory() as folder:
+        long = Path(folder) / "long.mp4"
+        repeat(video, long, frames)
+        began = time.perf_counter()
+        report = predict_with(
+            predictor, [long], Path(folder) / "out", clip=Clip(max_frames=frames), overlay=overlay, road=road
+        )
+        size = sum(file.stat().st_size for file in (Path(folder) / "out").iterdir()) / 1e6
+    taken = time.perf_counter() - began
+    print(f"{report.frames} frames in {taken:.0f} s, {size:.0f} MB written; {resident():.1f} MB resident after")
+    print(f"growth from the third tenth to the last: {marks[-1] - marks[2]:.1f} MB")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("video", type=Path)
@@ -110,11 +166,20 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--overlay", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--camera", type=Path, help="measure the road with this camera, and track vehicles")
+    parser.add_argument("--long-side", type=int, help="of the network's input")
+    parser.add_argument("--memory", type=int, metavar="FRAMES", help="only watch memory, over so many frames")
     options = parser.parse_args()
     road = RoadOptions() if options.camera is None else RoadOptions(measure=True, camera=options.camera, track=True)
     predictor = trilitenet.load(
-        options.model, device=options.device, backend=options.backend, batch_size=options.batch_size
+        options.model,
+        device=options.device,
+        backend=options.backend,
+        batch_size=options.batch_size,
+        long_side=options.long_side,
     )
+    if options.memory:
+        memory(predictor, options.video, options.memory, options.overlay, road)
+        return
     first = next(iter(VideoReader(options.video))).image
     batch = np.stack([predictor.preprocess(first)[0]] * options.batch_size)
     pure_inference(predictor, batch, 20)
