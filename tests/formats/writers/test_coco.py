@@ -55,6 +55,24 @@ def test_supervision_opens_it(tmp_path: Path, pictures: list[Perception]) -> Non
     np.testing.assert_array_equal(detections.mask[2], pictures[0].drivable)
 
 
+def test_datumaro_opens_it(tmp_path: Path, pictures: list[Perception]) -> None:
+    datumaro = pytest.importorskip("datumaro")
+    path = write(tmp_path, pictures[:1])
+    for folder in ("annotations", "images/train"):
+        (tmp_path / folder).mkdir(parents=True)
+    path.rename(tmp_path / "annotations" / "instances_train.json")
+    cv2.imwrite(str(tmp_path / "images" / "train" / "road.jpg"), np.zeros((*pictures[0].size, 3), np.uint8))
+    (item,) = datumaro.Dataset.import_from(str(tmp_path), "coco")
+    assert pictures[0].boxes is not None
+    boxes = [annotation for annotation in item.annotations if annotation.type.name == "bbox"]
+    np.testing.assert_allclose(
+        sorted(box.points for box in boxes if box.label < 2), sorted(pictures[0].boxes.xyxy.tolist()), atol=0.01
+    )
+    masks = {annotation.label: annotation.image for annotation in item.annotations if annotation.type.name == "mask"}
+    np.testing.assert_array_equal(masks[2] > 0, pictures[0].drivable)
+    np.testing.assert_array_equal(masks[3] > 0, pictures[0].lane)
+
+
 def test_frames_of_a_video_are_named_and_tracked(tmp_path: Path, video: list[Perception]) -> None:
     document = json.loads(write(tmp_path, video).read_text(encoding="utf-8"))
     assert document["images"][3]["file_name"] == "drive-0000003.jpg"

@@ -35,6 +35,19 @@ def test_supervision_opens_it(tmp_path: Path, pictures: list[Perception]) -> Non
     np.testing.assert_array_equal(detections.class_id, pictures[0].boxes.class_id)
 
 
+def test_datumaro_opens_it(tmp_path: Path, pictures: list[Perception]) -> None:
+    datumaro = pytest.importorskip("datumaro")
+    with YoloWriter(tmp_path) as writer:
+        writer.write(pictures[0])
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "road.jpg"), np.zeros((*pictures[0].size, 3), np.uint8))
+    (item,) = datumaro.Dataset.import_from(str(tmp_path), "yolo")
+    assert pictures[0].boxes is not None
+    found = sorted((box.label, *box.points) for box in item.annotations)
+    wanted = sorted(zip(pictures[0].boxes.class_id, *pictures[0].boxes.xyxy.T, strict=True))
+    np.testing.assert_allclose(found, np.array(wanted), atol=0.01)
+
+
 def test_two_pictures_of_one_name_do_not_clash(tmp_path: Path, pictures: list[Perception]) -> None:
     with YoloWriter(tmp_path) as writer:
         for picture in pictures:
