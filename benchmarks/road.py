@@ -92,6 +92,7 @@ class Errors:
     def show(self) -> None:
         """Print a table."""
         units = {"offset": ("m", 1), "heading": ("rad", 1), "curvature": ("1/m", 1), "lead": ("%", 100)}
+        aims = {"offset": 0.1, "heading": 0.01, "lead": 0.05}
         print(f"{'':10} {'frames':>7} {'share':>6} {'mean':>9} {'median':>9} {'95%':>9} {'max':>9}")
         for name, (unit, gain) in units.items():
             values = np.array(self.values.get(name, [np.nan])) * gain
@@ -100,7 +101,9 @@ class Errors:
             )
             count = len(self.values.get(name, []))
             share = count / max(1, self.led if name == "lead" else self.frames)
-            print(f"{name:10} {count:7d} {share:6.1%} {figures} {unit}")
+            met = np.mean(np.array(self.values[name]) < aims[name]) if name in aims and count else None
+            aim = "" if met is None else f"; {met:.1%} below {aims[name] * gain:g} {unit}"
+            print(f"{name:10} {count:7d} {share:6.1%} {figures} {unit}{aim}")
         print(f"lead found in {self.found} of {self.led} frames with one up to 40 m; {self.frames} frames")
 
 

@@ -130,7 +130,9 @@ def test_a_wrong_horizon_is_told_by_the_error(drive: tuple[Scene, ...], perceive
     for scene in drive[8:24:4]:
         bad, good = wrong(perceived(scene)).lead, right(perceived(scene)).lead
         assert good is not None
-        assert bad is None or bad.distance.error > 3 * good.distance.error
+        if bad is not None:
+            assert bad.distance.error > 1.5 * good.distance.error
+            assert abs(bad.distance.value - good.distance.value) < 2 * bad.distance.error
 
 
 def test_nothing_in_sight_gives_nothing() -> None:

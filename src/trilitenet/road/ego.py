@@ -36,13 +36,17 @@ REACH: Final = 70.0
 PIXEL_ERROR: Final = 0.8
 """Standard deviation of a line's place in a 640-pixel picture, in pixels."""
 BOX_ERROR: Final = 1.0
-"""Standard deviation of a box's lower edge in a 640-pixel picture, in pixels."""
+"""Standard deviation of a box's lower edge in a 640-pixel picture, in pixels, however small the box."""
+BOX_ERROR_SHARE: Final = 0.09
+"""And, added to it, as a share of the box's shorter side: what the shipped weights miss on real frames at any size."""
 REAR_OVERHANG: Final = 0.8
 """Metres from a car's rear to where its rear tyres touch the road, which is the lowest that is seen of it."""
 OVERHANG_ERROR: Final = 0.25
 """Standard deviation of that, in metres: cars differ."""
 IN_LANE: Final = 0.7
 """A vehicle is in the ego lane when its middle is within so much of half the lane's width."""
+MAX_OUTSIDE: Final = 0.2
+"""The vehicle's middle is at most so many metres outside of the lines of its own lane, as they are measured."""
 MAX_OFFSET_ERROR: Final = 0.4
 MAX_HEADING_ERROR: Final = 0.04
 MAX_CURVATURE_ERROR: Final = 0.006
@@ -178,7 +182,8 @@ def fit_ego_lane(
         value = -middle * cos
         tilt = (errors.yaw + errors.pitch) * float(x.min())
         error = math.sqrt(middle_error**2 + (value * errors.height) ** 2 + tilt**2)
-        offset = kept(value, error, MAX_OFFSET_ERROR)
+        if abs(value) < half + MAX_OUTSIDE:  # else these are not the lines of the lane that the vehicle is in
+            offset = kept(value, error, MAX_OFFSET_ERROR)
     heading = kept(
         -math.atan(slope),
         math.sqrt(float(variance[count]) + errors.yaw**2 + (errors.pitch * (middle or 0.0) / camera.height) ** 2),
@@ -237,7 +242,7 @@ def find_lead(boxes: Boxes, fit: LaneFit, camera: Camera, errors: CameraErrors) 
         distance = x - REAR_OVERHANG
         if distance <= 0.5 or (best is not None and distance >= best.distance.value):
             continue
-        error = _distance_error(x, camera, errors, BOX_ERROR * width / 640)
+        error = _distance_error(x, camera, errors, _box_error(boxes.xyxy[index], width))
         if error > MAX_DISTANCE_ERROR * distance:
             continue
         track = -1 if boxes.track_id is None else int(boxes.track_id[index])
@@ -251,14 +256,20 @@ def find_distances(boxes: Boxes, camera: Camera, errors: CameraErrors) -> tuple[
     left, _, right, bottom = boxes.xyxy.T.astype(np.float64) - 0.5
     ground = camera.to_ground(np.stack([(left + right) / 2, bottom], axis=1))
     found: list[Estimate | None] = []
-    for x, row in zip(ground[:, 0].tolist(), bottom.tolist(), strict=True):
+    for x, row, box in zip(ground[:, 0].tolist(), bottom.tolist(), boxes.xyxy, strict=True):
         estimate = None
         if math.isfinite(x) and x > REAR_OVERHANG + 0.5 and row < height - 1.5:
-            error = _distance_error(x, camera, errors, BOX_ERROR * width / 640)
+            error = _distance_error(x, camera, errors, _box_error(box, width))
             if error <= MAX_DISTANCE_ERROR * x:
                 estimate = Estimate(x - REAR_OVERHANG, error)
         found.append(estimate)
     return tuple(found)
+
+
+def _box_error(box: NDArray[np.float32], width: int) -> float:
+    """Return one standard deviation of a box's lower edge, in pixels of a picture of this width."""
+    side = float(min(box[2] - box[0], box[3] - box[1]))
+    return math.hypot(BOX_ERROR * width / 640, BOX_ERROR_SHARE * side)
 
 
 def _distance_error(x: float, camera: Camera, errors: CameraErrors, pixel: float) -> float:
