@@ -7,6 +7,7 @@ python benchmarks/road.py --clip docs/images/drive.webp   # a short animated ove
 python benchmarks/road.py --render drive           # drive/drive.mp4, camera.yaml and truth.json, and the figures
 python benchmarks/road.py --results results/drive.json --truth drive/truth.json   # what `trilitenet predict` made of it
 python benchmarks/road.py --lanes 100              # time of lanes as curves at 640x384; with --model its masks too
+python benchmarks/road.py --feet DATA --stride 2   # how far the lower edges of the network's boxes are from the labels'
 """
 
 from __future__ import annotations
@@ -141,6 +142,40 @@ def time_lanes(scenes: int, model: str | None) -> None:
             print(f"  {what:9} time: p50 {p50:.2f}, p99 {p99:.2f}, max {max(spent):.2f} ms")
 
 
+def miss_feet(data: Path, model: str, stride: int) -> None:
+    """Print how far the lower edges of boxes are from those of the labels, on validation frames in the usual layout."""
+    import trilitenet
+
+    predictor = trilitenet.load(model)
+    missed, heights = [], []
+    for path in sorted((data / "det_annotations" / "val").glob("*.json"))[::stride]:
+        objects = json.loads(path.read_text(encoding="utf-8"))["frames"][0]["objects"]
+        sure = [o["box2d"] for o in objects if "box2d" in o and not o["attributes"].get("crowd")]
+        labels = np.array([[box[key] for key in ("x1", "y1", "x2", "y2")] for box in sure], np.float64)
+        seen = predictor(data / "images" / "val" / f"{path.stem}.jpg")
+        assert isinstance(seen, Perception)
+        if seen.boxes is None or not len(seen.boxes) or not len(labels):
+            continue
+        low = np.maximum(labels[None, :, :2], seen.boxes.xyxy[:, None, :2])
+        high = np.minimum(labels[None, :, 2:], seen.boxes.xyxy[:, None, 2:])
+        shared = np.prod(np.maximum(high - low, 0), axis=2)
+        areas = [np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) for boxes in (seen.boxes.xyxy, labels)]
+        overlap = shared / (areas[0][:, None] + areas[1][None] - shared)
+        for index, best in enumerate(overlap.argmax(axis=1)):
+            feet = float(seen.boxes.xyxy[index, 3]), float(labels[best, 3])
+            if overlap[index, best] > 0.5 and max(feet) < seen.size[0] - 3:
+                missed.append((feet[0] - feet[1]) * 640 / seen.size[1])
+                heights.append((labels[best, 3] - labels[best, 1]) * 640 / seen.size[1])
+    error, tall = np.array(missed), np.array(heights)
+    for least, most in ((0, 20), (20, 40), (40, 80), (80, 640)):
+        part = (tall >= least) & (tall < most)
+        pixels, share = error[part], (error / tall)[part]
+        print(
+            f"{part.sum():5d} boxes {least} to {most} pixels high, of 640 across: mean {pixels.mean():+.2f}, root mean "
+            f"square {np.sqrt((pixels**2).mean()):.2f} pixels, or {np.sqrt((share**2).mean()):.3f} of the height"
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
@@ -156,7 +191,11 @@ def main() -> None:
     parser.add_argument("--results", type=Path, help="compare JSON of `trilitenet predict --road` with --truth")
     parser.add_argument("--truth", type=Path, help="truth.json of --render")
     parser.add_argument("--lanes", type=int, metavar="SCENES", help="only time lanes as curves, on so many scenes")
+    parser.add_argument("--feet", type=Path, metavar="DATA", help="only compare the model's boxes with labelled ones")
     options = parser.parse_args()
+    if options.feet:
+        miss_feet(options.feet, options.model or "tiny", options.stride)
+        return
     if options.lanes:
         time_lanes(options.lanes, options.model)
         return
