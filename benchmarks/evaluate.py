@@ -1,6 +1,7 @@
 """How much longer evaluating takes than inference alone, and how much memory it needs.
 
     python benchmarks/evaluate.py MODEL [--frames 1000] [--unique 100] [--protocol fair]
+    python benchmarks/evaluate.py MODEL --growth 100 1000 10000
 
 Synthetic scenes of 1280x720 are written to a temporary folder first, ``--unique`` of them, and taken round and round.
 Inference alone reads each image file and calls the predictor (letterbox, network, masks and boxes at native size).
@@ -57,6 +58,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--protocol", default="fair")
     parser.add_argument("--backend", default="auto")
+    parser.add_argument("--growth", type=int, nargs="+", help="instead: peak memory after so many frames, rising")
     parser.add_argument("--data", type=Path, help="a data set to use instead of synthetic scenes")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -70,6 +72,11 @@ def main() -> None:
         count = arguments.frames // arguments.rounds
         infer(model, dataset, 10)
         evaluate(model, Repeated(dataset, 10), protocol=arguments.protocol)
+        if arguments.growth:
+            for frames in arguments.growth:
+                evaluate(model, Repeated(dataset, frames), protocol=arguments.protocol)
+                print(f"{frames} frames: peak memory {peak_memory():.0f} MiB", flush=True)
+            return
         before = peak_memory()
         alone, scored = [], []
         for _ in range(arguments.rounds):

@@ -1,22 +1,26 @@
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
+import time
 import tracemalloc
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from tests.engine.labelled import Images, fake_predictor
+from tests.engine.labelled import FakeBackend, FakePredictor, Images, fake_predictor
 from trilitenet.config import Thresholds
 from trilitenet.data.sample import Sample
 from trilitenet.engine.evaluate import best_thresholds, evaluate, score_predictions
 from trilitenet.engine.predictions import PredictionWriter, SavedPredictions
 from trilitenet.engine.report import Report
 from trilitenet.engine.scorecard import Scorecard
-from trilitenet.errors import ConfigError, DataError
-from trilitenet.structures import Boxes, Perception
+from trilitenet.errors import BackendError, ConfigError, DataError
+from trilitenet.structures import Boxes, Perception, RawOutputs
 
 
 def values(report: Report) -> dict[str, float]:
@@ -245,3 +249,38 @@ def test_memory_grows_by_little_more_than_counts() -> None:
     tracemalloc.stop()
     # An image of 64x64 with its labels takes 20 kB; what stays of it is counts and 20 boxes of about 30 bytes.
     assert grown / 400 < 3000
+
+
+class ParallelBackend(FakeBackend):
+    inside = 0
+    fails = False
+
+    @contextlib.contextmanager
+    def in_parallel(self) -> Iterator[int]:
+        self.inside += 1
+        try:
+            yield 3
+        finally:
+            self.inside -= 1
+
+    def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
+        assert self.inside == 1
+        if self.fails:
+            raise BackendError("the runtime is gone")
+        number = int(batch[0, batch.shape[1] // 2, 0, 2])
+        time.sleep(0.01 * (3 - number % 3))  # batches finish in another order than they came
+        return super().run(batch)
+
+
+def test_a_backend_that_runs_in_parallel_changes_no_figure() -> None:
+    images = Images(20)
+    alone = evaluate(fake_predictor(images, drift=2), images, resamples=0)
+    backend = ParallelBackend(images, drift=2)
+    together = evaluate(FakePredictor(backend), images, resamples=0, batch_size=2)
+    assert backend.inside == 0
+    assert together.names == alone.names
+    assert values(together) == values(alone)
+    backend.fails = True
+    with pytest.raises(BackendError, match="gone"):
+        evaluate(FakePredictor(backend), images, resamples=0)
+    assert backend.inside == 0

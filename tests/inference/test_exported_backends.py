@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,27 @@ def test_equals_the_network(
         assert np.mean((mask > 0) == (getattr(wanted, task) > int(threshold * 255))) > pixels
     backend.close()
     backend.close()
+
+
+@pytest.mark.parametrize(("name", "kind"), [("model.onnx", OnnxBackend), ("model.xml", OpenVINOBackend)])
+def test_in_parallel_gives_the_same(artefacts: Artefacts, name: str, kind: Any) -> None:
+    backend = kind(artefacts.folder / name, threads=3)
+    images = [artefacts.images[index % len(artefacts.images)][None] for index in range(12)]
+    alone = [backend.run(image) for image in images]
+    with backend.in_parallel() as runners, ThreadPoolExecutor(runners) as pool:
+        assert runners == 3
+        together = list(pool.map(backend.run, images))
+    for one, other, after in zip(alone, together, map(backend.run, images), strict=True):
+        for got in (other, after):
+            np.testing.assert_allclose(got.detection, one.detection, rtol=1e-3, atol=1e-3)
+            assert np.mean(got.lane == one.lane) > 0.999
+
+
+def test_a_closed_model_says_so(artefacts: Artefacts) -> None:
+    backend = OpenVINOBackend(artefacts.folder / "model.xml")
+    backend.close()
+    with pytest.raises(BackendError, match="closed"):
+        backend.run(artefacts.images)
 
 
 @pytest.mark.parametrize("kind", [OnnxBackend, OpenVINOBackend])

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
@@ -69,3 +71,20 @@ def test_a_device_that_is_not_there_is_named(device: str) -> None:
 
 def test_auto_finds_a_device() -> None:
     assert pick_device().type in {"cpu", "cuda", "mps"}
+
+
+def test_in_parallel_each_thread_has_cores_of_its_own(backend: TorchBackend, rng: np.random.Generator) -> None:
+    batches = [rng.integers(0, 256, (1, 64, 96, 3), dtype=np.uint8) for _ in range(8)]
+    alone = [backend.run(batch).detection for batch in batches]
+    before = torch.get_num_threads()
+    torch.set_num_threads(4)
+    try:
+        with backend.in_parallel() as runners, ThreadPoolExecutor(runners) as pool:
+            assert runners == 4
+            assert pool.submit(torch.get_num_threads).result() == 1
+            together = list(pool.map(lambda batch: backend.run(batch).detection, batches))
+        assert torch.get_num_threads() == 4
+    finally:
+        torch.set_num_threads(before)
+    for one, other in zip(alone, together, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4)  # type: ignore[arg-type]

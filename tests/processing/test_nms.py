@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from trilitenet.processing.boxes import box_iou
 from trilitenet.processing.nms import nms
@@ -29,14 +30,16 @@ def test_number_of_boxes_is_bounded_and_none_is_none() -> None:
     assert nms(BOXES[:0], SCORES[:0], np.zeros(0, np.int64), 0.5, 10).tolist() == []
 
 
-def test_agrees_with_the_definition_on_random_boxes() -> None:
+@pytest.mark.parametrize(("count", "class_count"), [(300, 3), (300, 1), (2000, 2)])
+def test_agrees_with_the_definition_on_random_boxes(count: int, class_count: int) -> None:
     rng = np.random.default_rng(3)
-    low = rng.uniform(0, 200, (300, 2))
-    boxes = np.concatenate([low, low + rng.uniform(5, 60, (300, 2))], axis=1).astype(np.float32)
-    scores, classes = rng.random(300).astype(np.float32), rng.integers(0, 3, 300)
-    kept = nms(boxes, scores, classes, 0.45, 1000)
+    low = rng.uniform(0, 200 * count / 300, (count, 2))
+    boxes = np.concatenate([low, low + rng.uniform(5, 60, (count, 2))], axis=1).astype(np.float32)
+    scores, classes = rng.random(count).astype(np.float32), rng.integers(0, class_count, count)
+    kept = nms(boxes, scores, classes, 0.45, count)
     assert (np.diff(scores[kept]) <= 0).all()
+    assert nms(boxes, scores, classes, 0.45, 50).tolist() == kept[:50].tolist()
     overlap = box_iou(boxes, boxes)
-    for i in range(300):
+    for i in range(count):
         better = [k for k in kept if scores[k] > scores[i] and classes[k] == classes[i]]
         assert (i in kept) == (not better or overlap[i, better].max() <= 0.45)

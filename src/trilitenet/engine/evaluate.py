@@ -4,8 +4,8 @@
     report.fair.drivable.miou, report.fair.lane.f1, report.fair.detection.ap50
     sys.stdout.write(report.summary())
 
-Reading goes ahead in one thread and scoring follows in another, so that on two cores both mostly hide behind the
-network. Memory does not grow with the number of images beyond a few dozen numbers each.
+Reading goes ahead in one thread, scoring follows in another, and the network runs in one or several between them. Of an
+image stay counts and some 30 bytes a box.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ import collections
 import dataclasses
 import datetime
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Final, Protocol, TypeVar
+from contextlib import AbstractContextManager, closing, nullcontext
+from typing import Any, Final, Protocol, TypeVar, runtime_checkable
 
 import cv2
 import numpy as np
@@ -48,6 +49,7 @@ __all__ = [
 LOWEST_CONFIDENCE: Final = 0.001
 """Boxes down to this confidence are scored (the published one); average precision needs the doubtful ones too."""
 
+_S = TypeVar("_S")
 _T = TypeVar("_T")
 Prediction = tuple[Perception | None, CanvasPrediction | None]
 ImageChange = Callable[[NDArray[np.uint8], str], NDArray[np.uint8]]
@@ -67,6 +69,14 @@ class RunsBatches(Protocol):
 
     def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
         """Run the network on (B, H, W, 3) uint8 RGB, letterboxed."""
+
+
+@runtime_checkable
+class RunsInParallel(Protocol):
+    """A backend that can trade latency for images a second."""
+
+    def in_parallel(self) -> AbstractContextManager[int]:
+        """Inside, yield from how many threads at once ``run`` is best called."""
 
 
 class EvaluatedPredictor(Protocol):
@@ -152,8 +162,9 @@ def evaluate(
             on_prediction(sample, prediction[0])
 
     native = "fair" in protocols or on_prediction is not None
-    with _InOrder() as scoring:
-        for samples, letterboxes, raw in _outputs(predictor, dataset, batch_size, limit, change):
+    outputs = closing(_outputs(predictor, dataset, batch_size, limit, change))
+    with outputs as batches, _InOrder() as scoring:
+        for samples, letterboxes, raw in batches:
             canvases.update(dict.fromkeys(letterbox.canvas for letterbox in letterboxes))
             for index, (sample, letterbox) in enumerate(zip(samples, letterboxes, strict=True)):
                 scoring.submit(
@@ -227,7 +238,7 @@ def score_predictions(
     count = len(dataset) if limit is None else min(limit, len(dataset))
     canvases: dict[tuple[int, int], None] = {}
     known = 0
-    for sample, perception in _ahead(lambda index: _with_saved(dataset[index], predictions), range(count), 4):
+    for sample, perception in _ahead(lambda index: _with_saved(dataset[index], predictions), range(count), 4, "reader"):
         known += sample.name in predictions.names
         letterbox = Letterbox.fit(perception.size)
         canvases[letterbox.canvas] = None
@@ -442,8 +453,9 @@ def best_thresholds(
             if masks is not None and truth is not None:
                 counts[task] += _probability_counts(letterbox.mask_to_source(masks[index]), truth, sample.valid)
 
-    with _InOrder() as looking:
-        for samples, letterboxes, raw in _outputs(predictor, dataset, batch_size, limit, None):
+    outputs = closing(_outputs(predictor, dataset, batch_size, limit, None))
+    with outputs as batches, _InOrder() as looking:
+        for samples, letterboxes, raw in batches:
             for index, (sample, letterbox) in enumerate(zip(samples, letterboxes, strict=True)):
                 looking.submit(look, sample, raw, index, letterbox)
     drivable, drivable_iou = _best_cut(counts["drivable"], predictor.thresholds.drivable)
@@ -487,6 +499,7 @@ def _best_confidence(detection: DetectionMetric, default: float) -> tuple[float,
 
 
 _Outputs = tuple[list[LabelledImage], list[Letterbox], RawOutputs]
+_Batch = list[tuple[LabelledImage, NDArray[np.uint8], Letterbox]]
 
 
 def _outputs(
@@ -495,41 +508,54 @@ def _outputs(
     batch_size: int,
     limit: int | None,
     change: ImageChange | None,
-) -> Iterator[_Outputs]:
-    """Yield samples with what the network makes of them; reading and letterboxing go ahead in a second thread."""
+) -> Generator[_Outputs, None, None]:
+    """Yield samples with what the network makes of them, in order.
+
+    Reading and letterboxing go ahead in a thread of their own. Where the backend can, several threads compute a batch
+    each on cores of their own: scoring beside a network that has all cores would make each of its layers wait.
+    """
     count = len(dataset) if limit is None else min(limit, len(dataset))
     if count < 1 or batch_size < 1:
         raise DataError(f"no images to evaluate on (images {count}, batch size {batch_size})")
+    backend = predictor.backend
 
     def prepare(index: int) -> tuple[LabelledImage, NDArray[np.uint8], Letterbox]:
         sample = dataset[index]
         image = sample.image if change is None else change(sample.image, sample.name)
         return sample, *predictor.preprocess(image)
 
-    samples: list[LabelledImage] = []
-    canvases: list[NDArray[np.uint8]] = []
-    letterboxes: list[Letterbox] = []
-    for sample, canvas, letterbox in _ahead(prepare, range(count), 2 * batch_size + 2):
-        if samples and (len(samples) == batch_size or canvas.shape != canvases[0].shape):
-            yield samples, letterboxes, predictor.backend.run(_stack(canvases))
-            samples, canvases, letterboxes = [], [], []
-        samples.append(sample)
-        canvases.append(canvas)
-        letterboxes.append(letterbox)
-    yield samples, letterboxes, predictor.backend.run(_stack(canvases))
+    def run(batch: _Batch) -> _Outputs:
+        samples, canvases, letterboxes = zip(*batch, strict=True)
+        return list(samples), list(letterboxes), backend.run(_stack(canvases))
+
+    with backend.in_parallel() if isinstance(backend, RunsInParallel) else nullcontext(1) as runners:
+        read = _ahead(prepare, range(count), batch_size * (runners + 1) + 1, "reader")
+        yield from _ahead(run, _batches(read, batch_size), runners, "network", runners)
+
+
+def _batches(read: Iterable[tuple[LabelledImage, NDArray[np.uint8], Letterbox]], batch_size: int) -> Iterator[_Batch]:
+    """Gather images that follow each other and have a canvas of one size."""
+    batch: _Batch = []
+    for one in read:
+        if batch and (len(batch) == batch_size or one[1].shape != batch[0][1].shape):
+            yield batch
+            batch = []
+        batch.append(one)
+    if batch:
+        yield batch
 
 
 def _stack(canvases: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
     return canvases[0][None] if len(canvases) == 1 else np.stack(canvases)
 
 
-def _ahead(prepare: Callable[[int], _T], order: Iterable[int], depth: int) -> Iterator[_T]:
-    """Yield what is prepared, in order, up to ``depth`` ahead."""
-    with ThreadPoolExecutor(1, thread_name_prefix="reader") as pool:
+def _ahead(prepare: Callable[[_S], _T], order: Iterable[_S], depth: int, name: str, threads: int = 1) -> Iterator[_T]:
+    """Yield what threads prepare of each, in order, up to ``depth`` ahead."""
+    with ThreadPoolExecutor(threads, thread_name_prefix=name) as pool:
         waiting: collections.deque[Future[_T]] = collections.deque()
         try:
-            for index in order:
-                waiting.append(pool.submit(prepare, index))
+            for one in order:
+                waiting.append(pool.submit(prepare, one))
                 if len(waiting) > depth:
                     yield waiting.popleft().result()
             while waiting:

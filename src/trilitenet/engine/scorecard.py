@@ -148,8 +148,9 @@ class Scorecard:
         for protocol, metric in metrics.items():
             if metric is None:
                 continue
+            plain = metric.figures()
             spread = bootstrap(metric.figures, count, resamples, seed)
-            for name, value in metric.figures().items():
+            for name, value in plain.items():
                 low, high = interval(spread[name]) if resamples else (None, None)
                 figures[f"{protocol}/{name}"] = Figure(float(value[0]), low, high)
             if rows:

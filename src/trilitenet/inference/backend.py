@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+import os
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,15 @@ from numpy.typing import NDArray
 from trilitenet.config import ModelCard
 from trilitenet.structures import RawOutputs
 
-__all__ = ["Backend"]
+__all__ = ["MOST_PARALLEL", "Backend", "usable_cores"]
+
+MOST_PARALLEL: Final = 4
+"""At most so many images are computed at once where a backend trades latency for images a second."""
+
+
+def usable_cores() -> int:
+    """Return on how many processor cores this process may run."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @runtime_checkable

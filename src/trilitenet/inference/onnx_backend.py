@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import ModelCard
 from trilitenet.errors import BackendError, WeightsError, import_extra
+from trilitenet.inference.backend import MOST_PARALLEL, usable_cores
 from trilitenet.inference.exported import prepare_input, read_metadata, run_images
 from trilitenet.structures import RawOutputs
 
@@ -48,21 +50,25 @@ class OnnxBackend:
         providers = ["CPUExecutionProvider"]
         if device != "cpu" and "CUDAExecutionProvider" in available:
             providers.insert(0, "CUDAExecutionProvider")
-        options = runtime.SessionOptions()
+        self._runtime, self._path, self._providers, self._threads = runtime, path, providers, threads
+        self._session = self._open(threads)
+        self._card, self.info = read_metadata(self._session.get_modelmeta().custom_metadata_map, str(path))
+        self._input = self._session.get_inputs()[0].name
+        self._outputs = [output.name for output in self._session.get_outputs()]
+        self._device = "cuda" if self._session.get_providers()[0].startswith("CUDA") else "cpu"
+
+    def _open(self, threads: int | None) -> Any:
+        options = self._runtime.SessionOptions()
         options.log_severity_level = 3
         # Between two frames the threads would spin, while the next frame is read and prepared on the same cores.
         options.add_session_config_entry("session.force_spinning_stop", "1")
         if threads is not None:
             options.intra_op_num_threads = threads
         try:
-            self._session = runtime.InferenceSession(str(path), options, providers=providers)
+            return self._runtime.InferenceSession(str(self._path), options, providers=self._providers)
         except Exception as error:  # its exceptions share no base class of their own
             reason = " ".join(str(error).split())[:160]
-            raise WeightsError(f"{path}: not a usable ONNX model ({reason})") from error
-        self._card, self.info = read_metadata(self._session.get_modelmeta().custom_metadata_map, str(path))
-        self._input = self._session.get_inputs()[0].name
-        self._outputs = [output.name for output in self._session.get_outputs()]
-        self._device = "cuda" if self._session.get_providers()[0].startswith("CUDA") else "cpu"
+            raise WeightsError(f"{self._path}: not a usable ONNX model ({reason})") from error
 
     @property
     def card(self) -> ModelCard:
@@ -95,6 +101,20 @@ class OnnxBackend:
             ]
 
         return run_images(batch, self._card, outputs, self.info)
+
+    @contextlib.contextmanager
+    def in_parallel(self) -> Iterator[int]:
+        """Inside, images share no cores; yields from how many threads `run` is best called."""
+        cores = self._threads or usable_cores()
+        count = min(MOST_PARALLEL, cores) if self._device == "cpu" else 1
+        if count == 1:
+            yield 1
+            return
+        before, self._session = self._session, self._open(cores // count)
+        try:
+            yield count
+        finally:
+            self._session = before
 
     def close(self) -> None:
         """Nothing to free before the object goes."""

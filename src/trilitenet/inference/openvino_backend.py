@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import collections
+import contextlib
 import os
-from collections.abc import Mapping
+import queue
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ModelCard
 from trilitenet.errors import BackendError, ConfigError, WeightsError, import_extra
+from trilitenet.inference.backend import MOST_PARALLEL, usable_cores
 from trilitenet.inference.exported import prepare_input, read_metadata, run_images
 from trilitenet.structures import RawOutputs
 
@@ -76,23 +80,27 @@ class OpenVINOBackend:
             raise ConfigError(f"unknown precision {wanted!r}; known: {', '.join(_HINTS)}")
         capable = {str(name).lower() for name in core.get_property(self._device, "OPTIMIZATION_CAPABILITIES")}
         self.precision = wanted if wanted in capable else "fp32"
+        self._core, self._model, self._path, self._threads = core, model, path, threads
+        self.streams = streams
+        compiled = self._compile(streams)
+        self._outputs = [output.get_any_name() for output in compiled.outputs]
+        self._idle: queue.SimpleQueue[Any] | None = _requests(compiled, streams)
+
+    def _compile(self, streams: int) -> Any:
         options: dict[str, Any] = {
             "INFERENCE_PRECISION_HINT": _HINTS[self.precision],
             "PERFORMANCE_HINT": "LATENCY" if streams == 1 else "THROUGHPUT",
         }
         if self._device == "CPU":
             options["NUM_STREAMS"] = str(streams)
-            if threads is not None:
-                options["INFERENCE_NUM_THREADS"] = threads
+            if self._threads is not None:
+                options["INFERENCE_NUM_THREADS"] = self._threads
         try:
-            self._compiled = core.compile_model(model, self._device, options)
+            return self._core.compile_model(self._model, self._device, options)
         except RuntimeError as error:
             raise BackendError(
-                f"{path}: OpenVINO cannot compile it for {self._device} ({' '.join(str(error).split())[:160]})"
+                f"{self._path}: OpenVINO cannot compile it for {self._device} ({' '.join(str(error).split())[:160]})"
             ) from error
-        self._outputs = [output.get_any_name() for output in self._compiled.outputs]
-        self.streams = streams
-        self._requests = [self._compiled.create_infer_request() for _ in range(streams)]
 
     @property
     def card(self) -> ModelCard:
@@ -112,27 +120,60 @@ class OpenVINOBackend:
 
     def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
         """Run the network on (B, H, W, 3) uint8 RGB; images of a batch share the streams. See `Backend.run`."""
+        idle = self._idle
+        if idle is None:
+            raise BackendError(f"{self._path}: the model was closed")
 
         def outputs() -> list[Mapping[str, NDArray[Any]]]:
             results: list[Mapping[str, NDArray[Any]]] = []
-            for start in range(0, len(batch), self.streams):
-                inputs = [prepare_input(image, self.info) for image in batch[start : start + self.streams]]
-                busy = self._requests[: len(inputs)]
-                for request, image in zip(busy, inputs, strict=True):
-                    request.start_async([image], share_inputs=True)
-                for request in busy:
-                    request.wait()
-                    # Copies: the request's own memory is written again by its next image.
-                    results.append(
-                        {name: np.array(request.get_output_tensor(i).data) for i, name in enumerate(self._outputs)}
-                    )
+            inputs = collections.deque(prepare_input(image, self.info) for image in batch)
+            while inputs:
+                busy = [idle.get()]
+                while len(busy) < len(inputs) and not idle.empty():
+                    try:
+                        busy.append(idle.get_nowait())
+                    except queue.Empty:  # another thread was quicker
+                        break
+                try:
+                    for request in busy:
+                        request.start_async([inputs.popleft()], share_inputs=True)
+                    for request in busy:
+                        request.wait()
+                        # Copies: the request's own memory is written again by its next image.
+                        results.append(
+                            {name: np.array(request.get_output_tensor(i).data) for i, name in enumerate(self._outputs)}
+                        )
+                finally:
+                    for request in busy:
+                        idle.put(request)
             return results
 
         return run_images(batch, self._card, outputs, self.info)
 
+    @contextlib.contextmanager
+    def in_parallel(self) -> Iterator[int]:
+        """Inside, the model is compiled for one stream a core; yields from how many threads `run` is best called."""
+        count = min(MOST_PARALLEL, self._threads or usable_cores()) if self._device == "CPU" else 1
+        if count <= self.streams:
+            yield self.streams
+            return
+        before, self._idle = self._idle, _requests(self._compile(count), count)
+        try:
+            yield count
+        finally:
+            self._idle = before
+
     def close(self) -> None:
         """Free the compiled model's requests."""
-        self._requests = []
+        self._idle = None
+
+
+def _requests(compiled: Any, count: int) -> queue.SimpleQueue[Any]:
+    """Return so many requests that are free to be used."""
+    idle: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    for _ in range(count):
+        idle.put(compiled.create_infer_request())
+    return idle
 
 
 def _metadata(model: Any) -> dict[str, str]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -9,6 +12,7 @@ from torch import Tensor
 
 from trilitenet.config import ModelCard
 from trilitenet.errors import BackendError
+from trilitenet.inference.backend import MOST_PARALLEL
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
 from trilitenet.structures import RawOutputs
 
@@ -83,6 +87,20 @@ class TorchBackend:
                 f"{self.name} is out of memory for {len(batch)} images of {batch.shape[2]}x{batch.shape[1]}; "
                 "use a smaller batch"
             ) from error
+
+    @contextlib.contextmanager
+    def in_parallel(self) -> Iterator[int]:
+        """Inside, images share no cores; yields from how many threads, new ones, `run` is best called."""
+        cores = torch.get_num_threads()
+        count = min(MOST_PARALLEL, cores) if self.device.type == "cpu" else 1
+        if count == 1:
+            yield 1
+            return
+        torch.set_num_threads(cores // count)  # for threads that begin now
+        try:
+            yield count
+        finally:
+            torch.set_num_threads(cores)
 
     def close(self) -> None:
         """Nothing to free."""

@@ -145,6 +145,7 @@ class DetectionMetric:
         self._ignored = Rows(areas, np.uint16)
         self._objects = Rows(areas * classes, np.int32)
         self._labelled = Rows(1, np.bool_)
+        self._ranked: dict[tuple[int, int], RankedBoxes] = {}
         self._confusion: NDArray[np.int64] = np.zeros((classes + 1, classes + 1), np.int64)
 
     def __len__(self) -> int:
@@ -185,6 +186,7 @@ class DetectionMetric:
         Raises:
             ShapeError: If scores, class ids and boxes differ in number.
         """
+        self._ranked.clear()
         index = len(self._labelled)
         labelled = boxes is not None and truth is not None
         self._labelled.append(labelled)
@@ -316,15 +318,7 @@ class DetectionMetric:
         out = np.full((rounds, len(self.class_names), len(chosen)), np.nan)
         column = list(AREAS).index(area)
         for number in range(len(self.class_names)):
-            mine = np.flatnonzero(self._class.array[:, 0] == number)
-            ranked = RankedBoxes(
-                self._scores.array[mine, 0],
-                self._image.array[mine, 0],
-                self._matched.array[mine, column],
-                self._ignored.array[mine, column],
-                len(self),
-                _ALL_BITS,
-            )
+            ranked = self._ranking(number, column)
             objects = self._objects_of(number, column, weights)
             for sums in ranked.sums(weights, len(self)):
                 for position, level in enumerate(chosen):
@@ -332,6 +326,21 @@ class DetectionMetric:
                     hit, counted = (ranked.right & bit) != 0, (ranked.ignored & bit) == 0
                     out[sums.rows, number, position] = _ap(sums, hit, counted, objects[sums.rows])
         return out
+
+    def _ranking(self, number: int, column: int) -> RankedBoxes:
+        """Return the boxes of a class, ranked: once for all weightings."""
+        ranked = self._ranked.get((number, column))
+        if ranked is None:
+            mine = np.flatnonzero(self._class.array[:, 0] == number)
+            ranked = self._ranked[number, column] = RankedBoxes(
+                self._scores.array[mine, 0],
+                self._image.array[mine, 0],
+                self._matched.array[mine, column],
+                self._ignored.array[mine, column],
+                len(self),
+                _ALL_BITS,
+            )
+        return ranked
 
     def curve(self) -> DetectionCurve:
         """Return precision and recall at IoU 0.5 along falling confidence, all classes together."""
@@ -435,13 +444,13 @@ class DetectionMetric:
             "class_names": list(self.class_names),
             "confidence": self.confidence,
             "max_boxes": self.max_boxes,
-            "scores": [float(f"{score:.9g}") for score in self._scores.array[:, 0]],
-            "image": self._image.array[:, 0].tolist(),
-            "class_id": self._class.array[:, 0].tolist(),
-            "matched": self._matched.array.tolist(),
-            "ignored": self._ignored.array.tolist(),
-            "objects": self._objects.array.tolist(),
-            "labelled": self._labelled.array[:, 0].astype(int).tolist(),
+            "scores": self._scores.pack(),
+            "image": self._image.pack(),
+            "class_id": self._class.pack(),
+            "matched": self._matched.pack(),
+            "ignored": self._ignored.pack(),
+            "objects": self._objects.pack(),
+            "labelled": self._labelled.pack(),
             "confusion": self._confusion.tolist(),
         }
 
@@ -449,14 +458,13 @@ class DetectionMetric:
     def from_state(cls, state: dict[str, Any]) -> DetectionMetric:
         """Read what `state` returned."""
         metric = cls(state["class_names"], state["confidence"], state["max_boxes"])
-        areas = len(AREAS)
-        metric._scores.append(np.asarray(state["scores"], np.float32).reshape(-1, 1))
-        metric._image.append(np.asarray(state["image"], np.int32).reshape(-1, 1))
-        metric._class.append(np.asarray(state["class_id"], np.int16).reshape(-1, 1))
-        metric._matched.append(np.asarray(state["matched"], np.uint16).reshape(-1, areas))
-        metric._ignored.append(np.asarray(state["ignored"], np.uint16).reshape(-1, areas))
-        metric._objects.append(np.asarray(state["objects"], np.int32).reshape(-1, areas * len(metric.class_names)))
-        metric._labelled.append(np.asarray(state["labelled"], np.bool_).reshape(-1, 1))
+        metric._scores.unpack(state["scores"])
+        metric._image.unpack(state["image"])
+        metric._class.unpack(state["class_id"])
+        metric._matched.unpack(state["matched"])
+        metric._ignored.unpack(state["ignored"])
+        metric._objects.unpack(state["objects"])
+        metric._labelled.unpack(state["labelled"])
         metric._confusion = np.asarray(state["confusion"], np.int64)
         return metric
 

@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -105,23 +106,24 @@ def thin(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     stride = width + 2
     # Neighbours P2 .. P9 clockwise from above, bit 0 .. 7.
     offsets = (-stride, -stride + 1, 1, stride + 1, stride, stride - 1, -1, -stride - 1)
-    tables = _thinning_tables()
+    code = np.asarray(cv2.filter2D(padded, cv2.CV_8U, _NEIGHBOUR_BITS, borderType=cv2.BORDER_CONSTANT)).ravel()
     pixels = np.flatnonzero(flat.view(np.bool_))
-    code = np.zeros(len(flat), np.uint8)
-    for bit, offset in enumerate(offsets):
-        code[pixels - offset] |= np.uint8(1 << bit)
-    changed = True
-    while changed:
-        changed = False
-        for table in tables:
-            goes = table[code[pixels]]
-            if goes.any():
-                gone, pixels = pixels[goes], pixels[~goes]
-                flat[gone] = 0
-                for bit, offset in enumerate(offsets):
-                    code[gone - offset] &= np.uint8(255 - (1 << bit))
-                changed = True
+    idle = 0  # passes in a row that took nothing away
+    for table in itertools.cycle(_thinning_tables()):
+        goes = table[code[pixels]]
+        gone = pixels[goes]
+        idle = 0 if len(gone) else idle + 1
+        if idle == 2:
+            break
+        pixels = pixels[~goes]
+        flat[gone] = 0
+        for bit, offset in enumerate(offsets):
+            code[gone - offset] &= np.uint8(255 - (1 << bit))
     return np.array(padded[1:-1, 1:-1], np.uint8)
+
+
+_NEIGHBOUR_BITS: Final = np.array([[128, 1, 2], [64, 0, 4], [32, 16, 8]], np.float32)
+"""What each neighbour of a pixel adds to its code: P2, above, is bit 0, and so on clockwise."""
 
 
 @functools.cache
@@ -286,8 +288,8 @@ class LaneMetric:
             "tolerances": list(self.tolerances),
             "tolerance": self.tolerance,
             "pixels": self._pixels.state(),
-            "width_counts": self._widths.array.tolist(),
-            "near_counts": self._near.array.tolist(),
+            "width_counts": self._widths.pack(),
+            "near_counts": self._near.pack(),
         }
 
     @classmethod
@@ -295,9 +297,11 @@ class LaneMetric:
         """Read what `state` returned."""
         metric = cls(state["widths"], state["tolerances"], state["tolerance"])
         metric._pixels = SegmentationMetric.from_state(state["pixels"])
-        count = len(metric._pixels)
-        metric._widths.append(np.asarray(state["width_counts"], np.int64).reshape(count, -1))
-        metric._near.append(np.asarray(state["near_counts"], np.int64).reshape(count, -1))
+        if metric.widths:
+            metric._widths.unpack(state["width_counts"])
+        else:
+            metric._widths.append(np.zeros((len(metric._pixels), 0)))
+        metric._near.unpack(state["near_counts"])
         return metric
 
 

@@ -175,16 +175,16 @@ class PublishedSegmentation:
         """Return the counts an image, as ``json.dumps`` takes them."""
         return {
             "batch_size": self.batch_size,
-            "counts": self._counts.array.tolist(),
-            "labelled": self._labelled.array[:, 0].astype(int).tolist(),
+            "counts": self._counts.pack(),
+            "labelled": self._labelled.pack(),
         }
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> PublishedSegmentation:
         """Read what `state` returned."""
         metric = cls(state["batch_size"])
-        metric._counts.append(np.asarray(state["counts"], np.int64).reshape(-1, 4))
-        metric._labelled.append(np.asarray(state["labelled"], np.bool_).reshape(-1, 1))
+        metric._counts.unpack(state["counts"])
+        metric._labelled.unpack(state["labelled"])
         return metric
 
 
@@ -233,6 +233,7 @@ class PublishedDetection:
         self._right = Rows(1, np.uint16)  # one bit an IoU threshold
         self._objects = Rows(self.classes, np.int32)
         self._labelled = Rows(1, np.bool_)
+        self._ranked: dict[int, RankedBoxes] = {}
 
     def __len__(self) -> int:
         return len(self._labelled)
@@ -257,6 +258,7 @@ class PublishedDetection:
         Raises:
             ShapeError: If scores, class ids and boxes differ in number.
         """
+        self._ranked.clear()
         if boxes is None or scores is None or class_id is None or truth is None or truth_class is None:
             self._objects.append(np.zeros(self.classes, np.int32))
             self._labelled.append(False)
@@ -299,17 +301,8 @@ class PublishedDetection:
         shape = (rounds, self.classes)
         recall, precision = np.full(shape, np.nan), np.full(shape, np.nan)
         ap = np.full((*shape, len(self._thresholds)), np.nan)
-        nothing = np.zeros(len(self._scores), np.uint16)
         for number in range(self.classes):
-            mine = np.flatnonzero(self._class.array[:, 0] == number)
-            ranked = RankedBoxes(
-                self._scores.array[mine, 0],
-                self._image.array[mine, 0],
-                self._right.array[mine, 0],
-                nothing[mine],
-                len(self),
-                (1 << len(self._thresholds)) - 1,
-            )
+            ranked = self._ranking(number)
             for sums in ranked.sums(weights, len(self)):
                 count = objects[sums.rows, number]
                 for level in range(len(self._thresholds)):
@@ -327,6 +320,21 @@ class PublishedDetection:
             "map": mean_known(ap.reshape(rounds, -1)),
         }
 
+    def _ranking(self, number: int) -> RankedBoxes:
+        """Return the boxes of a class, ranked: once for all weightings."""
+        ranked = self._ranked.get(number)
+        if ranked is None:
+            mine = np.flatnonzero(self._class.array[:, 0] == number)
+            ranked = self._ranked[number] = RankedBoxes(
+                self._scores.array[mine, 0],
+                self._image.array[mine, 0],
+                self._right.array[mine, 0],
+                np.zeros(len(mine), np.uint16),
+                len(self),
+                (1 << len(self._thresholds)) - 1,
+            )
+        return ranked
+
     def compute(self) -> PublishedDetectionScores:
         """Return the scores over all images."""
         labelled = self._labelled.array[:, 0]
@@ -342,24 +350,24 @@ class PublishedDetection:
         """Return what was kept, as ``json.dumps`` takes it."""
         return {
             "classes": self.classes,
-            "scores": [float(f"{score:.9g}") for score in self._scores.array[:, 0]],
-            "image": self._image.array[:, 0].tolist(),
-            "class_id": self._class.array[:, 0].tolist(),
-            "right": self._right.array[:, 0].tolist(),
-            "objects": self._objects.array.tolist(),
-            "labelled": self._labelled.array[:, 0].astype(int).tolist(),
+            "scores": self._scores.pack(),
+            "image": self._image.pack(),
+            "class_id": self._class.pack(),
+            "right": self._right.pack(),
+            "objects": self._objects.pack(),
+            "labelled": self._labelled.pack(),
         }
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> PublishedDetection:
         """Read what `state` returned."""
         metric = cls(state["classes"])
-        metric._scores.append(np.asarray(state["scores"], np.float32).reshape(-1, 1))
-        metric._image.append(np.asarray(state["image"], np.int32).reshape(-1, 1))
-        metric._class.append(np.asarray(state["class_id"], np.int16).reshape(-1, 1))
-        metric._right.append(np.asarray(state["right"], np.uint16).reshape(-1, 1))
-        metric._objects.append(np.asarray(state["objects"], np.int32).reshape(-1, metric.classes))
-        metric._labelled.append(np.asarray(state["labelled"], np.bool_).reshape(-1, 1))
+        metric._scores.unpack(state["scores"])
+        metric._image.unpack(state["image"])
+        metric._class.unpack(state["class_id"])
+        metric._right.unpack(state["right"])
+        metric._objects.unpack(state["objects"])
+        metric._labelled.unpack(state["labelled"])
         return metric
 
 

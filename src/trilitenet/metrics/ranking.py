@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 __all__ = ["RankedBoxes", "RankedSums"]
 
 FloatArray = NDArray[np.float64]
-_BLOCK: Final = 4_000_000
+_BLOCK: Final = 1_000_000
 """Numbers held at once while summing."""
 
 

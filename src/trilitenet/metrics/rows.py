@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import zlib
 from typing import Any
 
 import numpy as np
@@ -40,6 +42,24 @@ class Rows:
             self._array = grown
         self._array[self._used : end] = block
         self._used = end
+
+    def pack(self) -> str:
+        """Return the rows as text: their bytes, little-endian, compressed by zlib, in base64."""
+        little = self.array.astype(self._array.dtype.newbyteorder("<"), order="C", copy=False)
+        return base64.b64encode(zlib.compress(little.tobytes(), 1)).decode("ascii")
+
+    def unpack(self, text: str) -> None:
+        """Append what `pack` returned for rows of the same columns and type.
+
+        Raises:
+            ValueError: If it is no such text.
+        """
+        try:
+            data = zlib.decompress(base64.b64decode(text, validate=True))
+        except (zlib.error, TypeError) as error:
+            raise ValueError(f"not packed rows ({error})") from error
+        little = np.frombuffer(data, self._array.dtype.newbyteorder("<"))
+        self.append(little.reshape(-1, self._array.shape[1]))
 
     def clear(self) -> None:
         """Drop all rows."""

@@ -219,12 +219,12 @@ class SegmentationMetric:
 
     def state(self) -> dict[str, Any]:
         """Return the counts an image, as ``json.dumps`` takes them."""
-        return {"counts": self._counts.array.tolist(), "labelled": self._labelled.array[:, 0].astype(int).tolist()}
+        return {"counts": self._counts.pack(), "labelled": self._labelled.pack()}
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> SegmentationMetric:
         """Read what `state` returned."""
         metric = cls()
-        metric._counts.append(np.asarray(state["counts"], np.int64).reshape(-1, 4))
-        metric._labelled.append(np.asarray(state["labelled"], np.bool_).reshape(-1, 1))
+        metric._counts.unpack(state["counts"])
+        metric._labelled.unpack(state["labelled"])
         return metric

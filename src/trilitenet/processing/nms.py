@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 __all__ = ["nms"]
+
+_BLOCK: Final = 512
+"""Boxes that OpenCV looks at in one go: it compares all of them, however few may be kept."""
 
 
 def nms(
@@ -30,18 +34,45 @@ def nms(
         (K,) positions of the boxes kept, best first, K <= ``max_boxes``.
     """
     order = np.argsort(-scores, kind="stable")
-    left, top, right, bottom = np.ascontiguousarray(xyxy[order].T)
-    classes = class_id[order]
-    area = (right - left) * (bottom - top)
-    one_class = len(classes) == 0 or bool((classes == classes[0]).all())
-    kept: list[int] = []
-    rest = np.arange(len(order))
-    while len(rest) and len(kept) < max_boxes:
-        best, rest = rest[0], rest[1:]
-        kept.append(int(best))
-        width = np.minimum(right[best], right[rest]) - np.maximum(left[best], left[rest])
-        height = np.minimum(bottom[best], bottom[rest]) - np.maximum(top[best], top[rest])
-        intersection = np.maximum(width, 0) * np.maximum(height, 0)
-        stays = intersection <= iou * (area[best] + area[rest] - intersection)
-        rest = rest[stays if one_class else stays | (classes[rest] != classes[best])]
-    return order[kept].astype(np.int64, copy=False)
+    boxes, classes = xyxy[order].astype(np.float64), class_id[order].astype(np.int32)
+    kept = np.zeros(0, np.int64)
+    for start in range(0, len(order), _BLOCK):
+        if len(kept) >= max_boxes:
+            break
+        block = np.arange(start, min(start + _BLOCK, len(order)))
+        if len(kept):
+            block = block[~_suppressed(boxes[block], classes[block], boxes[kept], classes[kept], iou)]
+        kept = np.concatenate([kept, block[_greedy(boxes[block], classes[block], iou)]])
+    return order[kept[:max_boxes]].astype(np.int64, copy=False)
+
+
+def _greedy(boxes: NDArray[np.float64], classes: NDArray[np.int32], iou: float) -> NDArray[np.int64]:
+    """Return the positions that stay, of boxes sorted best first."""
+    if not len(boxes):
+        return np.zeros(0, np.int64)
+    rectangles = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
+    rank = np.arange(len(boxes), 0, -1, dtype=np.float32)  # in place of the scores, to keep the order of equal ones
+    if (classes == classes[0]).all():
+        stays = cv2.dnn.NMSBoxes(rectangles, rank, 0.0, iou)  # type: ignore[arg-type]
+    else:
+        stays = cv2.dnn.NMSBoxesBatched(rectangles, rank, classes, 0.0, iou)  # type: ignore[arg-type]
+    return np.asarray(stays, np.int64).reshape(-1)
+
+
+def _suppressed(
+    boxes: NDArray[np.float64],
+    classes: NDArray[np.int32],
+    better: NDArray[np.float64],
+    better_classes: NDArray[np.int32],
+    iou: float,
+) -> NDArray[np.bool_]:
+    """Return (N,) whether each box overlaps one of the better ones of its class by more than ``iou``."""
+    left, top, right, bottom = np.ascontiguousarray(boxes.T)[:, :, None]
+    better_left, better_top, better_right, better_bottom = np.ascontiguousarray(better.T)
+    width = np.minimum(right, better_right) - np.maximum(left, better_left)
+    height = np.minimum(bottom, better_bottom) - np.maximum(top, better_top)
+    shared = np.maximum(width, 0) * np.maximum(height, 0)
+    area, better_area = (right - left) * (bottom - top), (better_right - better_left) * (better_bottom - better_top)
+    over = shared > iou * (area + better_area - shared)
+    gone: NDArray[np.bool_] = (over & (classes[:, None] == better_classes[None])).any(axis=1)
+    return gone
