@@ -69,6 +69,7 @@ COMMANDS: Final[tuple[Command, ...]] = (
     Command("data show", "data", "show"),
     Command("data synthesize", "synthesize", "synthesize"),
     Command("evaluate", "evaluate", "evaluate"),
+    Command("evaluate-table", "evaluate_table", "evaluate_table"),
     Command("export", "export", "export"),
     Command("predict", "predict", "predict"),
     Command("score", "score", "score"),

@@ -1,0 +1,197 @@
+"""Measure models in several precisions: the counterpart of the paper's table of precision levels."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Final, Literal
+
+from trilitenet.commands.evaluate import evaluate, hash_dataset, hash_model
+from trilitenet.commands.export import export
+from trilitenet.data.reading import DrivingDataset
+from trilitenet.engine.report import Report, read_report
+from trilitenet.errors import ConfigError, OutputError
+
+__all__ = ["PrecisionRow", "PrecisionTable", "evaluate_table"]
+
+Precision = Literal["fp32", "fp16", "bf16", "int8"]
+
+_PAPER: Final = {
+    "paper/detection/recall": "Recall (%)",
+    "paper/detection/map50": "mAP@0.5 (%)",
+    "paper/drivable/miou": "Drivable mIoU (%)",
+    "paper/lane/acc": "Lane Acc (%)",
+    "paper/lane/iou": "Lane IoU (%)",
+}
+_FAIR: Final = {
+    "fair/detection/ap50": "AP50 (%)",
+    "fair/detection/f1": "Vehicle F1 (%)",
+    "fair/drivable/miou": "Drivable mIoU (%)",
+    "fair/drivable/iou": "Drivable IoU (%)",
+    "fair/lane/f1_2px": "Lane F1, 2 px (%)",
+    "fair/lane/iou": "Lane IoU (%)",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class PrecisionRow:
+    """One model in one precision.
+
+    Attributes:
+        model: As it was named.
+        precision: What the artefact was exported for.
+        runtime: What ran it, and in what it computes here: a processor without fp16 computes an fp16 artefact in fp32.
+        figures: ``protocol/task/name`` -> value in [0, 1].
+    """
+
+    model: str
+    precision: str
+    runtime: str
+    figures: dict[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class PrecisionTable:
+    """Models in several precisions.
+
+    Attributes:
+        rows: A model after the other; the first of each is what its others are compared with.
+    """
+
+    rows: tuple[PrecisionRow, ...]
+
+    def drop(self, row: PrecisionRow) -> tuple[float, str]:
+        """Return by how many points a row is at most below the first row of its model, and in which figure."""
+        first = next(one for one in self.rows if one.model == row.model)
+        lost = {key: 100 * (first.figures[key] - row.figures[key]) for key in (*_PAPER, *_FAIR) if key in row.figures}
+        worst = max(lost, key=lambda key: lost[key])
+        return lost[worst], worst
+
+    def summary(self) -> str:
+        """Return two tables in Markdown: the paper's columns by its protocol, and those of the fair one."""
+        parts = ["Protocol paper, the columns of the paper's table of precision levels:", ""]
+        parts += [*self._table(_PAPER), "", "Protocol fair:", "", *self._table(_FAIR), ""]
+        for row in self.rows:
+            lost, name = self.drop(row)
+            if lost > 0:
+                parts.append(f"{row.model} {row.precision}: loses at most {lost:.2f} points ({name})")
+        return "\n".join(parts)
+
+    def _table(self, columns: dict[str, str]) -> list[str]:
+        known = {key: title for key, title in columns.items() if any(key in row.figures for row in self.rows)}
+        lines = [_line(("Model", "Precision", "Runs as", *known.values())), _line(["---"] * (3 + len(known)))]
+        for row in self.rows:
+            first = next(one for one in self.rows if one.model == row.model)
+            cells = []
+            for key in known:
+                if key not in row.figures:
+                    cells.append("-")
+                    continue
+                points = 100 * (row.figures[key] - first.figures[key])
+                cells.append(f"{100 * row.figures[key]:.2f}" + ("" if row is first else f" ({points:+.2f})"))
+            lines.append(_line((row.model, row.precision, row.runtime, *cells)))
+        return lines
+
+
+def evaluate_table(
+    *models: str,
+    data: Path,
+    output: Path,
+    precisions: Sequence[Precision] = ("fp32", "fp16", "bf16", "int8"),
+    format: Literal["openvino", "onnx"] = "openvino",
+    size: str = "384x640",
+    split: str = "val",
+    calibration: Path | None = None,
+    calibration_frames: int = 500,
+    max_drop: float | None = None,
+    limit: int | None = None,
+    overwrite: bool = False,
+) -> PrecisionTable:
+    """Export models in several precisions, measure each by both protocols, and print the paper's table of precisions.
+
+    Artefacts and reports stay in the output folder; what is there of the same model, data and settings is not made
+    again.
+
+    Args:
+        models: Names of shipped weights, or weight files; tiny, small and base if left out.
+        data: Root folder of a data set in the published layout.
+        output: Folder for artefacts and reports.
+        precisions: fp32, fp16, bf16 (OpenVINO), int8; the others are compared with the first.
+        format: Runtime: openvino or onnx.
+        size: HEIGHTxWIDTH of the input, the same for all.
+        split: Split to measure on.
+        calibration: Frames for INT8: a data set's train split, or a folder of pictures; by default that of --data.
+        calibration_frames: At most so many of them.
+        max_drop: INT8 may lose at most so many points on the val split; layers fall back until it does.
+        limit: Measure on the first so many images alone.
+        overwrite: Make everything again.
+
+    Returns:
+        The table.
+
+    Raises:
+        ConfigError: If there is no precision, or the format lacks one.
+    """
+    if not precisions:
+        raise ConfigError("name at least one of --precisions fp32 fp16 bf16 int8")
+    if format == "onnx" and "bf16" in precisions:
+        raise ConfigError("onnx artefacts come as fp32, fp16, int8; leave bf16 out of --precisions")
+    data_hash = hash_dataset(DrivingDataset(data, split), limit)
+    rows: list[PrecisionRow] = []
+    for model in models or ("tiny", "small", "base"):
+        stamp = (hash_model(model) or "")[:12]
+        for precision in precisions:
+            name = f"{Path(model).stem}-{stamp}-{size}-{precision}"
+            if precision == "int8":
+                name += f"-{calibration_frames}" + ("" if max_drop is None else f"-drop{max_drop:g}")
+            artefact = output / f"{name}{'.xml' if format == 'openvino' else '.onnx'}"
+            report = None if overwrite else _done(output / name / "report.json", artefact, data_hash)
+            if report is None:
+                if overwrite or not artefact.exists():
+                    export(
+                        model,
+                        format=format,
+                        output=artefact,
+                        precision=precision,
+                        size=size,
+                        calibration=(calibration or data) if precision == "int8" else None,
+                        calibration_frames=calibration_frames,
+                        max_drop=max_drop if precision == "int8" else None,
+                        masks="probability",  # the protocols decide by thresholds of their own
+                        frames=data,
+                        overwrite=overwrite,
+                    )
+                report = evaluate(
+                    str(artefact),
+                    data=data,
+                    split=split,
+                    protocol="both",
+                    backend="openvino" if format == "openvino" else "onnxruntime",
+                    output=output / name,
+                    resamples=0,
+                    worst=0,
+                    limit=limit,
+                    overwrite=True,
+                )
+            figures = {key: figure.value for key, figure in report.figures.items()}
+            rows.append(PrecisionRow(model, precision, report.provenance.runtime, figures))
+    table = PrecisionTable(tuple(rows))
+    try:
+        (output / "precisions.md").write_text(table.summary() + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{output / 'precisions.md'}: cannot be written ({error})") from error
+    return table
+
+
+def _done(path: Path, artefact: Path, data_hash: dict[str, str]) -> Report | None:
+    """Return the report that is there, if it is of this artefact and of these images and labels."""
+    if not path.is_file() or not artefact.is_file():
+        return None
+    report = read_report(path)
+    same = report.provenance.model_sha256 == hash_model(str(artefact)) and report.provenance.data_sha256 == data_hash
+    return report if same else None
+
+
+def _line(cells: Iterable[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
