@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from tests.deploy.networks import lively_network
 from trilitenet.config import STRIDES, Thresholds
-from trilitenet.deploy.graph import DeployGraph
+from trilitenet.deploy.graph import AttentionGraph, DeployGraph
+from trilitenet.deploy.layers import Layout
 from trilitenet.deploy.layouts import LAYOUTS
 from trilitenet.errors import ConfigError, ShapeError
+from trilitenet.models.attention import PCAA
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
 
 
@@ -147,3 +150,18 @@ def test_wrong_options_and_shapes() -> None:
         DeployGraph(network, masks="soft")  # type: ignore[arg-type]
     with pytest.raises(ShapeError, match="uint8"):
         DeployGraph(network)(torch.zeros(1, 3, 64, 64))
+
+
+@pytest.mark.parametrize("channels", [32, 128, 256])
+@pytest.mark.parametrize("channels_last", [True, False])
+def test_attention_on_openvino_is_exact(channels: int, channels_last: bool) -> None:
+    openvino = pytest.importorskip("openvino")
+    torch.manual_seed(0)
+    attention = PCAA(channels).eval()
+    graph = AttentionGraph(attention, Layout(channels_last=channels_last)).eval()
+    x = 3 * torch.randn(1, channels, 24, 40)
+    with torch.no_grad():
+        wanted = attention(x)
+    model = openvino.convert_model(graph, example_input=x, input=[list(x.shape)])
+    got = openvino.compile_model(model, "CPU", {"INFERENCE_PRECISION_HINT": "f32"})([x.numpy()])[0]
+    assert np.abs(got - wanted.numpy()).max() < 1e-4

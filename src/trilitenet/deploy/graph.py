@@ -121,7 +121,10 @@ class AttentionGraph(nn.Module):
         pixels = self.split(x)  # (B, bins, R, C)
         weights = F.softmax(torch.matmul(self.maps, pixels.transpose(2, 3)), -1)  # (B, bins, K, R)
         confidence = torch.sigmoid(torch.matmul(pixels.mean(2), self.maps_transposed) + self.maps_bias)
-        local = torch.matmul(weights, pixels) * confidence.unsqueeze(-1)  # (B, bins, K, C)
+        # Weighted after the reshape: next to the product, OpenVINO 2026.4 fuses the two and computes them wrong in fp32
+        # for 128 channels and more.
+        local = torch.matmul(weights, pixels).reshape(batch, bins * channels, channels)  # (B, bins K, C)
+        local = local * confidence.reshape(batch, bins * channels, 1)
         local = torch.matmul(self.nodes, local.reshape(batch, bins, -1)).reshape(batch, bins, channels, channels)
         local = F.prelu(local, self.nodes_slopes)
         keys = torch.matmul(local, self.key)
