@@ -152,6 +152,7 @@ def test_wrong_options_and_shapes() -> None:
         DeployGraph(network)(torch.zeros(1, 3, 64, 64))
 
 
+@pytest.mark.filterwarnings("ignore:.*torch.jit.trace:DeprecationWarning")
 @pytest.mark.parametrize("channels", [32, 128, 256])
 @pytest.mark.parametrize("channels_last", [True, False])
 def test_attention_on_openvino_is_exact(channels: int, channels_last: bool) -> None:
