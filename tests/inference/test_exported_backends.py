@@ -74,6 +74,22 @@ def test_in_parallel_gives_the_same(artefacts: Artefacts, name: str, kind: Any) 
             assert np.mean(got.lane == one.lane) > 0.999
 
 
+def test_the_first_two_images_of_a_process_may_come_at_once(artefacts: Artefacts) -> None:
+    program = f"""
+import threading, numpy as np
+from trilitenet.inference.openvino_backend import OpenVINOBackend
+backend = OpenVINOBackend({str(artefacts.folder / "model.xml")!r}, streams=2)
+barrier = threading.Barrier(2)
+def work():
+    barrier.wait()
+    backend.run(np.zeros((1, {SIZE[0]}, {SIZE[1]}, 3), np.uint8))
+threads = [threading.Thread(target=work) for _ in range(2)]
+[thread.start() for thread in threads]
+[thread.join() for thread in threads]
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+
+
 def test_a_closed_model_says_so(artefacts: Artefacts) -> None:
     backend = OpenVINOBackend(artefacts.folder / "model.xml")
     backend.close()

@@ -6,6 +6,7 @@ import collections
 import contextlib
 import os
 import queue
+import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from trilitenet.structures import RawOutputs
 
 __all__ = ["OpenVINOBackend"]
 
+_FIRST_TENSOR = threading.Lock()
 _HINTS = {"fp32": "f32", "fp16": "f16", "bf16": "bf16"}
 
 
@@ -55,6 +57,10 @@ class OpenVINOBackend:
         threads: int | None = None,
     ) -> None:
         openvino = import_extra("openvino", "openvino")
+        with _FIRST_TENSOR:
+            # The first tensor of a process sets up NumPy for OpenVINO's binding; two threads that do so at once wait
+            # for each other for ever.
+            openvino.Tensor(np.zeros(1, np.uint8))
         path = Path(path)
         if not path.is_file():
             raise WeightsError(f"{path}: no such file")
