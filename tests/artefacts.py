@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ class Artefacts:
     """Files of one small-input tiny network, and what it returns.
 
     Attributes:
-        folder: Holds weights.safetensors, model.onnx and model.xml.
+        folder: Holds weights.safetensors, model.onnx, model.xml and, where NCNN is installed, model.ncnn.param.
         images: (2, 64, 128, 3) uint8 RGB.
     """
 
@@ -46,4 +47,10 @@ def make_artefacts(folder: Path) -> Artefacts:
     save_onnx(model, folder / "model.onnx")
     info = dataclasses.replace(info, format="openvino", precision="bf16")
     save_openvino(build_openvino(model), folder / "model.xml", card, info)
+    if importlib.util.find_spec("pnnx") is not None:
+        from trilitenet.deploy.ncnn import build_ncnn, save_ncnn
+
+        info = ArtefactInfo("ncnn", size=SIZE, input="float_nchw", masks="logit", trilitenet="0")
+        graph = DeployGraph(network, LAYOUTS["planar"], masks="logit")
+        save_ncnn(build_ncnn(graph, card, info), folder / "model.ncnn.param", card, info)
     return Artefacts(folder, np.random.default_rng(0).integers(0, 256, (2, *SIZE, 3), np.uint8))

@@ -212,6 +212,8 @@ CARD_KEY: Final = "trilitenet.card"
 """Key of the card in a file's metadata."""
 ARTEFACT_KEY: Final = "trilitenet.artefact"
 """Key of the artefact's description in an exported file's metadata."""
+WEIGHTS_HASH_KEY: Final = "trilitenet.weights_sha256"
+"""Key of the SHA-256 of an artefact's weights, where these and the metadata are files of their own."""
 ARTEFACT_SCHEMA: Final = 1
 """Version of the artefact's description; a file with a higher one is refused."""
 
@@ -221,7 +223,7 @@ class ArtefactInfo:
     """How an exported artefact takes pixels and returns results; what the network is stands in its card.
 
     Attributes:
-        format: ``"onnx"``, ``"openvino"``, ``"tensorrt"`` or ``"torch"``.
+        format: ``"onnx"``, ``"openvino"``, ``"ncnn"``, ``"tensorrt"`` or ``"torch"``.
         precision: ``"fp32"``, ``"fp16"``, ``"bf16"`` or ``"int8"``.
         size: (height, width) of the input in pixels; None if any multiples of 32 will do.
         input: ``"uint8_nhwc"``: (B, H, W, 3) uint8, or ``"float_nchw"``: (B, 3, H, W) float32 of 0 .. 255. B is 1.

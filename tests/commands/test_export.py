@@ -33,6 +33,9 @@ def test_options_that_do_not_fit(artefacts: Artefacts, tmp_path: Path) -> None:
         ({"size": "big"}, "HEIGHTxWIDTH"),
         ({"format": "torch", "nms": True}, "--nms"),
         ({"max_drop": 0.5}, "--max-drop"),
+        ({"format": "ncnn", "precision": "bf16"}, "ncnn artefacts come as fp32, fp16, not bf16"),
+        ({"format": "ncnn", "size": "dynamic"}, "ncnn needs a fixed --size"),
+        ({"format": "ncnn", "output": tmp_path / "a.param"}, "end with .ncnn.param"),
         ({"output": tmp_path / "a.xml"}, "end with .onnx"),
     )
     for options, message in cases:
@@ -77,6 +80,20 @@ def test_tensorrt_without_tensorrt_says_how(artefacts: Artefacts, tmp_path: Path
     assert "no engine was built" in done.summary()
     assert "trtexec --onnx=" in done.summary()
     assert trilitenet.load(done.path).backend.canvas == (64, 128)
+
+
+@pytest.mark.parametrize("precision", ["fp32", "fp16"])
+def test_ncnn(artefacts: Artefacts, tmp_path: Path, frames: Path, precision: Any) -> None:
+    pytest.importorskip("ncnn")
+    pytest.importorskip("pnnx")
+    weights, path = str(artefacts.folder / "weights.safetensors"), tmp_path / "made" / "a.ncnn.param"
+    done = export(weights, format="ncnn", precision=precision, bgr=True, size="64x128", output=path, frames=frames)
+    assert done.parity is not None
+    assert done.parity.failures == []
+    assert sorted(file.suffix for file in path.parent.iterdir()) == [".bin", ".json", ".param"]
+    with trilitenet.load(path.parent) as predictor:
+        assert predictor.card.licence == "MIT"
+        assert predictor(np.zeros((90, 160, 3), np.uint8)).size == (90, 160)
 
 
 @pytest.mark.slow

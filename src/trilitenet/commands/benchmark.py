@@ -154,7 +154,7 @@ def benchmark(
         source: Height and width of the image for --stage frame.
         device: auto, cpu, cuda.
         streams: Images OpenVINO computes at once; use with --batch of as many or more.
-        threads: Threads of ONNX Runtime or OpenVINO.
+        threads: Threads of ONNX Runtime, OpenVINO or NCNN.
         output: JSON file to write.
         plot: Picture (.png, .svg) of the distributions to write.
 

@@ -19,6 +19,7 @@ from trilitenet.config import ARTEFACT_KEY, CARD_KEY, MAX_STRIDE, ArtefactInfo
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.deploy.graph import DeployGraph, Masks
 from trilitenet.deploy.layouts import pick_layout
+from trilitenet.deploy.ncnn import build_ncnn, save_ncnn
 from trilitenet.deploy.onnx import build_onnx, save_onnx
 from trilitenet.deploy.openvino import build_openvino, has_amx, save_openvino
 from trilitenet.deploy.parity import TOLERANCES, Parity, compare
@@ -38,13 +39,20 @@ from trilitenet.structures import RawOutputs
 
 __all__ = ["Exported", "export"]
 
-Format = Literal["onnx", "openvino", "tensorrt", "torch", "triton"]
+Format = Literal["onnx", "openvino", "ncnn", "tensorrt", "torch", "triton"]
 Precision = Literal["fp32", "fp16", "bf16", "int8"]
 
-_SUFFIXES = {"onnx": ".onnx", "openvino": ".xml", "tensorrt": ".engine", "torch": ".pt2"}
+_SUFFIXES = {
+    "onnx": ".onnx",
+    "openvino": ".xml",
+    "ncnn": ".ncnn.param",
+    "tensorrt": ".engine",
+    "torch": ".pt2",
+}
 _PRECISIONS = {
     "onnx": ("fp32", "fp16", "int8"),
     "openvino": ("fp32", "fp16", "bf16", "int8"),
+    "ncnn": ("fp32", "fp16"),
     "tensorrt": ("fp32", "fp16", "bf16", "int8"),
     "torch": ("fp32",),
     "triton": ("fp32", "fp16", "int8"),
@@ -104,11 +112,12 @@ def export(
 
     Args:
         model: Name of shipped weights, or a file of weights.
-        format: onnx, openvino (.xml and .bin), tensorrt (.engine, or .onnx and the trtexec line), torch (.pt2) or
-            triton (a model repository with an ONNX graph in it).
+        format: onnx, openvino (.xml and .bin), ncnn (.ncnn.param, .bin and .json), tensorrt (.engine, or .onnx and the
+            trtexec line), torch (.pt2) or triton (a model repository with an ONNX graph in it).
         output: File to write (for triton, the folder of the repository); by default named after the model, here.
-        precision: fp32, fp16 (weights stored so), bf16 (OpenVINO) or int8 (needs --calibration).
-        size: HEIGHTxWIDTH of the input in multiples of 32, or dynamic.
+        precision: fp32, fp16 (weights stored so; on Arm, NCNN computes so too), bf16 (OpenVINO) or int8 (needs
+            --calibration).
+        size: HEIGHTxWIDTH of the input in multiples of 32, or dynamic (not ncnn).
         calibration: Frames for INT8: a data set in the published layout (its train split) or a folder of pictures.
         calibration_frames: At most so many of them.
         max_drop: INT8 may lose at most so many points of a score on the val split of --calibration; layers fall back
@@ -138,11 +147,13 @@ def export(
         raise ConfigError("int8 needs --calibration: a data set in the published layout, or a folder of road frames")
     if max_drop is not None and precision != "int8":
         raise ConfigError("--max-drop is for --precision int8")
-    if format == "tensorrt":
+    if format in ("ncnn", "tensorrt"):
         portable = True
     parsed = _parse_size(size)
     if precision == "int8" and parsed is None:
         raise ConfigError("int8 needs a fixed --size")
+    if format == "ncnn" and parsed is None:
+        raise ConfigError("ncnn needs a fixed --size")
     if portable:
         masks = "logit"
     network = load_network(model).eval()
@@ -174,7 +185,7 @@ def export(
         serve = f"Serve it with: tritonserver --model-repository {repository.resolve()}"
         return dataclasses.replace(exported, path=path, notes=(*exported.notes, serve))
     path = output or Path(f"{Path(model).stem}{_SUFFIXES[format]}")
-    if path.suffix != _SUFFIXES[format] and format != "tensorrt":
+    if not path.name.endswith(_SUFFIXES[format]) and format != "tensorrt":
         raise ConfigError(f"{format} artefacts end with {_SUFFIXES[format]}, not {path.suffix or 'nothing'}")
     if path.exists() and not overwrite:
         raise OutputError(f"{path}: exists already; give another --output or --overwrite")
@@ -201,6 +212,8 @@ def export(
     canvas = parsed or network.card.input_size
     if format == "torch":
         return _export_torch(network, graph, info, path, _canvases(frames, canvas, 8))
+    if format == "ncnn":
+        return _keep(network, build_ncnn(graph, network.card, info), info, path, _canvases(frames, canvas, 8))
     thresholds = network.card.thresholds if nms else None
     proto = build_onnx(graph, network.card, info, nms=thresholds, half=format == "onnx" and precision == "fp16")
     if format == "tensorrt":
@@ -269,6 +282,8 @@ def _as_input(canvas: NDArray[np.uint8], info: ArtefactInfo) -> NDArray[Any]:
 def _write(built: Any, path: Path, network: TriLiteNet, info: ArtefactInfo) -> None:
     if info.format == "openvino":
         save_openvino(built, path, network.card, info)
+    elif info.format == "ncnn":
+        save_ncnn(built, path, network.card, info)
     else:
         save_onnx(built, path)
 
@@ -293,6 +308,10 @@ def _open(path: Path, info: ArtefactInfo) -> Backend:
         from trilitenet.inference.openvino_backend import OpenVINOBackend
 
         return OpenVINOBackend(path)
+    if info.format == "ncnn":
+        from trilitenet.inference.ncnn_backend import NcnnBackend
+
+        return NcnnBackend(path)
     from trilitenet.inference.onnx_backend import OnnxBackend
 
     return OnnxBackend(path, "cpu")

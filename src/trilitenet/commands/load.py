@@ -6,16 +6,24 @@ import dataclasses
 import importlib.util
 import os
 from pathlib import Path
+from typing import Final
 
-from trilitenet.config import ModelCard, Thresholds
+from trilitenet.config import VARIANTS, ModelCard, Thresholds
 from trilitenet.errors import ConfigError, did_you_mean
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.predictor import Predictor
 
 __all__ = ["BACKENDS", "load"]
 
-BACKENDS = ("auto", "torch", "onnxruntime", "openvino", "tensorrt")
+BACKENDS = ("auto", "torch", "onnxruntime", "openvino", "ncnn", "tensorrt")
 """What ``backend`` may be."""
+_RUNS: Final[dict[str, tuple[str, ...]]] = {
+    ".onnx": ("openvino", "onnxruntime"),
+    ".xml": ("openvino",),
+    ".param": ("ncnn",),
+    ".engine": ("tensorrt",),
+}
+"""Runtimes of a file by its suffix; others run on PyTorch."""
 
 
 def load(
@@ -35,11 +43,12 @@ def load(
     """Load a model as a predictor.
 
     Args:
-        model: Name of shipped weights, a file of weights, or an exported artefact (.onnx, .xml, .engine, .pt2).
+        model: Name of shipped weights, a file of weights, or an exported artefact (.onnx, .xml, .param or the folder
+            it is in, .engine, .pt2).
         device: auto (the best there is), cpu, cuda, cuda:1, mps.
-        backend: auto (the fastest present that runs the file), torch, onnxruntime, openvino or tensorrt. A file of
-            weights runs on PyTorch: on CUDA, auto is its deploy graph in fp16 under CUDA graphs, torch the plain
-            network in fp32.
+        backend: auto (the fastest present that runs the file), torch, onnxruntime, openvino, ncnn or tensorrt. A
+            file of weights runs on PyTorch: on CUDA, auto is its deploy graph in fp16 under CUDA graphs, torch the
+            plain network in fp32.
         confidence: Keep boxes whose confidence is above this, in [0, 1]; the model's own if left out.
         iou: A box goes when it overlaps a better one by more, in [0, 1]; the model's own if left out.
         drivable: A pixel is drivable above this probability, in [0, 1]; the model's own if left out.
@@ -47,7 +56,7 @@ def load(
         long_side: The longer side of an image is resized to so many pixels; by default as in training.
         batch_size: At most so many images go through the network at once.
         streams: Images that OpenVINO computes at once: more frames a second, more latency.
-        threads: Threads of ONNX Runtime or OpenVINO; their own choice if left out.
+        threads: Threads of ONNX Runtime, OpenVINO or NCNN; their own choice if left out.
 
     Returns:
         The predictor.
@@ -67,9 +76,9 @@ def load(
 def _open(model: str | os.PathLike[str], device: str, backend: str, streams: int, threads: int | None) -> Backend:
     """Open a file on the runtime asked for, or on the fastest one here that runs it."""
     suffix, fastest = Path(model).suffix.lower(), backend == "auto"
-    runs = {".onnx": ("openvino", "onnxruntime"), ".xml": ("openvino",), ".engine": ("tensorrt",)}.get(
-        suffix, ("torch",)
-    )
+    if str(model) not in VARIANTS and Path(model).is_dir() and any(Path(model).glob("*.param")):
+        suffix = ".param"
+    runs = _RUNS.get(suffix, ("torch",))
     if backend == "auto":
         # OpenVINO was the faster of the two on every processor measured (docs/speed.md); it has no CUDA.
         usable = [name for name in runs if importlib.util.find_spec(name) is not None]
@@ -79,11 +88,7 @@ def _open(model: str | os.PathLike[str], device: str, backend: str, streams: int
     elif backend not in runs:
         raise ConfigError(
             f"{model} runs on {' or '.join(runs)}, not on {backend}"
-            + (
-                ""
-                if suffix in (".onnx", ".xml", ".engine")
-                else f"; make a file for it with: trilitenet export {model}"
-            )
+            + ("" if suffix in _RUNS else f"; make a file for it with: trilitenet export {model}")
         )
     if backend == "openvino":
         from trilitenet.inference.openvino_backend import OpenVINOBackend
@@ -93,6 +98,10 @@ def _open(model: str | os.PathLike[str], device: str, backend: str, streams: int
         from trilitenet.inference.onnx_backend import OnnxBackend
 
         return OnnxBackend(model, device, threads=threads)
+    if backend == "ncnn":
+        from trilitenet.inference.ncnn_backend import NcnnBackend
+
+        return NcnnBackend(model, device, threads=threads)
     if backend == "tensorrt":
         from trilitenet.inference.tensorrt_backend import TensorRTBackend
 

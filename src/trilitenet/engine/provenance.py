@@ -18,7 +18,7 @@ import trilitenet
 
 __all__ = ["describe_hardware", "describe_versions", "hash_files", "peak_memory"]
 
-_RUNTIMES: Final = ("torch", "onnxruntime", "openvino", "tensorrt")
+_RUNTIMES: Final = ("torch", "onnxruntime", "openvino", "ncnn", "tensorrt")
 
 
 def hash_files(paths: Iterable[Path]) -> str:

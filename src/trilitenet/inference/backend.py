@@ -24,7 +24,7 @@ def usable_cores() -> int:
 
 @runtime_checkable
 class Backend(Protocol):
-    """A network on a runtime: PyTorch, ONNX Runtime, OpenVINO, TensorRT, or a fake in tests.
+    """A network on a runtime: PyTorch, ONNX Runtime, OpenVINO, NCNN, TensorRT, or a fake in tests.
 
     Attributes:
         card: What the network is: classes, normalisation, thresholds.
