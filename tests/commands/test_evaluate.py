@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from tests.artefacts import Artefacts
 from trilitenet.apps.cli import main
 from trilitenet.commands.compare import compare
 from trilitenet.commands.evaluate import evaluate
 from trilitenet.commands.score import score
-from trilitenet.config import ModelCard
+from trilitenet.config import ARTEFACT_KEY, ModelCard
 from trilitenet.data.synthetic_files import write_dataset
 from trilitenet.engine.report import Report
 from trilitenet.errors import ConfigError, DataError, OutputError
@@ -123,3 +124,21 @@ def test_a_missing_split_is_told(data: Path, weights: Path) -> None:
 def test_scoring_and_comparing_load_no_torch() -> None:
     code = "import sys, trilitenet.commands.score, trilitenet.commands.compare; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_an_artefact_that_decides_masks_is_not_measured_by_the_published_protocol(
+    artefacts: Artefacts, data: Path
+) -> None:
+    with pytest.raises(ConfigError, match="--masks probability"):
+        evaluate(str(artefacts.folder / "model.onnx"), data=data, protocol="paper")
+
+
+def test_an_artefact_that_suppresses_boxes_is_not_measured(artefacts: Artefacts, data: Path, tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load(str(artefacts.folder / "model.onnx"))
+    for entry in model.metadata_props:
+        if entry.key == ARTEFACT_KEY:
+            entry.value = json.dumps(json.loads(entry.value) | {"nms": True})
+    onnx.save(model, str(tmp_path / "nms.onnx"))
+    with pytest.raises(ConfigError, match="without --nms"):
+        evaluate(str(tmp_path / "nms.onnx"), data=data)

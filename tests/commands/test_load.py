@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import trilitenet
+from tests.artefacts import Artefacts
 from trilitenet.config import Thresholds
 from trilitenet.errors import BackendError, ConfigError, WeightsError
 from trilitenet.models.trilitenet import build_network
@@ -31,6 +32,12 @@ def test_load_gives_a_predictor(weights: Path) -> None:
 def test_thresholds_can_be_overridden_one_by_one(weights: Path) -> None:
     predictor = trilitenet.load(weights, device="cpu", confidence=0.7, lane=0.2)
     assert predictor.thresholds == Thresholds(confidence=0.7, lane=0.2)
+
+
+def test_masks_that_are_decided_inside_take_no_thresholds(artefacts: Artefacts) -> None:
+    assert trilitenet.load(artefacts.folder / "model.onnx", confidence=0.6).thresholds.confidence == 0.6
+    with pytest.raises(ConfigError, match="--masks probability"):
+        trilitenet.load(artefacts.folder / "model.onnx", drivable=0.7)
 
 
 def test_mistakes_are_named(weights: Path) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from trilitenet.commands.load import load
+from trilitenet.config import ArtefactInfo
 from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER, DrivingDataset
 from trilitenet.engine.evaluate import EvaluatedPredictor
 from trilitenet.engine.evaluate import evaluate as run_evaluation
@@ -93,6 +94,7 @@ def evaluate(
         lane=lane,
         long_side=long_side,
     )
+    _check_artefact(model, predictor, protocol)
     with predictor, ExitStack() as stack:
         dataset = DrivingDataset(data, split, class_names=predictor.card.class_names)
         writer = None
@@ -131,6 +133,28 @@ def evaluate(
         report = dataclasses.replace(report, variations=tuple(variations))
     write_report(report, output)
     return report
+
+
+def _check_artefact(model: str, predictor: Predictor, protocol: str) -> None:
+    """Refuse an artefact that has decided already what a protocol decides.
+
+    Raises:
+        ConfigError: If it has.
+    """
+    info: ArtefactInfo | None = getattr(predictor.backend, "info", None)
+    if info is None:
+        return
+    if info.nms and "detection" in predictor.card.tasks:
+        raise ConfigError(
+            f"{model} suppresses boxes inside, and those under its confidence are gone; "
+            "average precision needs them: export it without --nms"
+        )
+    thresholds = predictor.card.thresholds
+    if protocol != "fair" and info.masks != "probability" and not thresholds.drivable == thresholds.lane == 0.5:
+        raise ConfigError(
+            f"{model} decides masks inside, by thresholds of its own; the 'paper' protocol takes the likelier class: "
+            "export it with --masks probability"
+        )
 
 
 def _resized(predictor: Predictor, sides: Sequence[int]) -> dict[int, EvaluatedPredictor]:

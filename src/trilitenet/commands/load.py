@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 from typing import Final
 
-from trilitenet.config import VARIANTS, ModelCard, Thresholds
+from trilitenet.config import VARIANTS, ArtefactInfo, ModelCard, Thresholds
 from trilitenet.errors import ConfigError, did_you_mean
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.predictor import Predictor
@@ -69,6 +69,12 @@ def load(
     if backend not in BACKENDS:
         raise ConfigError(f"unknown backend {backend!r}{did_you_mean(backend, BACKENDS)}")
     runtime = _open(model, device, backend, streams, threads)
+    info: ArtefactInfo | None = getattr(runtime, "info", None)
+    if info is not None and info.masks != "probability" and (drivable is not None or lane is not None):
+        raise ConfigError(
+            f"{model} decides masks inside, by the thresholds of the model it was exported from; "
+            "for others export it with --masks probability"
+        )
     thresholds = _override(runtime.card, confidence=confidence, iou=iou, drivable=drivable, lane=lane)
     return Predictor(runtime, thresholds, long_side=long_side, batch_size=batch_size)
 
