@@ -39,6 +39,15 @@ def test_good_anchors_are_kept() -> None:
     assert fit.fit_after == pytest.approx(1.0)
 
 
+def test_anchors_that_suit_well_enough_are_kept() -> None:
+    boxes = wide_boxes()
+    recall = best_possible_recall(boxes, np.array(DEFAULT_ANCHORS).reshape(-1, 2))
+    assert fit_anchors(boxes, DEFAULT_ANCHORS, enough=recall + 0.001).changed
+    kept = fit_anchors(boxes, DEFAULT_ANCHORS, enough=recall)
+    assert not kept.changed
+    assert kept.anchors == DEFAULT_ANCHORS
+
+
 def test_is_deterministic() -> None:
     assert fit_anchors(wide_boxes(), DEFAULT_ANCHORS, seed=3) == fit_anchors(wide_boxes(), DEFAULT_ANCHORS, seed=3)
 
@@ -71,3 +80,8 @@ class _Source:
 
 def test_sizes_are_in_input_pixels() -> None:
     assert box_sizes(_Source(), (384, 640)).tolist() == [[50.0, 20.0]]
+
+
+def test_the_published_sizes_are_tall() -> None:
+    # 100 of 1280 columns times the 360 rows of the resized image, 40 of 720 rows times its 640 columns.
+    assert box_sizes(_Source(), (384, 640), swapped=True)[0] == pytest.approx([28.125, 35.556], abs=1e-3)

@@ -112,7 +112,7 @@ def slow_loss(
         totals[0] += box_loss / max(number, 1)
         totals[1] += balance * objectness / max(cells, 1)
         if classes > 1 or single_class_loss:
-            totals[2] += class_loss / max(number, 1)
+            totals[2] += class_loss / max(number, 1) / (80 if classes == 1 else 1)
     return 0.05 * totals[0], totals[1], 0.5 * totals[2]
 
 

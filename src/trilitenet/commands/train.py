@@ -158,7 +158,10 @@ def _network(config: TrainConfig, dataset: SampleSource, display: _Display, *, r
     """Build the network: anchors, initial weights, frozen parts."""
     anchors = config.anchors
     if config.auto_anchor and anchors is None and "detection" in config.tasks and not resume:
-        fit = fit_anchors(box_sizes(dataset, config.input_size, seed=config.seed), DEFAULT_ANCHORS, seed=config.seed)
+        swapped = config.swapped_anchors
+        sizes = box_sizes(dataset, config.input_size, seed=config.seed, swapped=swapped)
+        enough = 2.0 if swapped else config.anchor_recall
+        fit = fit_anchors(sizes, DEFAULT_ANCHORS, enough=enough, seed=config.seed)
         display.line(fit.summary())
         anchors = fit.anchors
     network = build_network(

@@ -51,7 +51,7 @@ class AnchorFit:
 
 
 def box_sizes(
-    dataset: SampleSource, canvas: tuple[int, int], *, limit: int = 5000, seed: int = 0
+    dataset: SampleSource, canvas: tuple[int, int], *, limit: int = 5000, seed: int = 0, swapped: bool = False
 ) -> NDArray[np.float64]:
     """Return (N, 2) width and height of the labelled boxes in pixels of the letterboxed input.
 
@@ -60,6 +60,8 @@ def box_sizes(
         canvas: (height, width) of the input.
         limit: At most so many images are read, drawn at random.
         seed: Of that draw.
+        swapped: As the published code has it: the width, as a share of the image's, times the height of the resized
+            image, and the height times its width.
     """
     order = np.random.default_rng(seed).permutation(len(dataset))[:limit]
     sizes = [np.zeros((0, 2))]
@@ -67,7 +69,8 @@ def box_sizes(
         sample = dataset[int(index)]
         if sample.boxes is not None and len(sample.boxes):
             resized = Letterbox.fit(sample.size, canvas=canvas).resized
-            scale = np.array([resized[1] / sample.size[1], resized[0] / sample.size[0]])
+            width, height = resized if swapped else resized[::-1]
+            scale = np.array([width / sample.size[1], height / sample.size[0]])
             sizes.append((sample.boxes[:, 2:] - sample.boxes[:, :2]) * scale)
     return np.concatenate(sizes)
 
@@ -91,15 +94,22 @@ def best_possible_recall(sizes: NDArray[np.float64], anchors: NDArray[np.float64
 
 
 def fit_anchors(
-    sizes: NDArray[np.float64], before: Anchors, *, ratio_limit: float = 4.0, min_side: float = 2.0, seed: int = 0
+    sizes: NDArray[np.float64],
+    before: Anchors,
+    *,
+    ratio_limit: float = 4.0,
+    min_side: float = 2.0,
+    enough: float = 2.0,
+    seed: int = 0,
 ) -> AnchorFit:
-    """Fit nine anchors by k-means, and keep the old ones where they suit no worse.
+    """Fit nine anchors by k-means, and keep the old ones where they suit no worse, or well enough.
 
     Args:
         sizes: (N, 2) width and height of boxes in input pixels.
         before: Anchors to compare with.
         ratio_limit: See `trilitenet.losses.detection.match`.
         min_side: Boxes with a side under so many pixels are left out.
+        enough: Keep the old ones when their best possible recall reaches this.
         seed: Of k-means.
 
     Raises:
@@ -120,7 +130,7 @@ def fit_anchors(
     new = np.exp(centres)
     new = np.round(new[np.argsort(new.prod(axis=1))], 1)
     scores = [(best_possible_recall(sizes, a, ratio_limit), float(_worst_ratio(sizes, a).mean())) for a in (old, new)]
-    changed = scores[1][1] > scores[0][1] and scores[1][0] >= scores[0][0] - 1e-3
+    changed = scores[0][0] < enough and scores[1][1] > scores[0][1] and scores[1][0] >= scores[0][0] - 1e-3
     chosen = new if changed else old
     anchors = tuple(
         tuple((float(width), float(height)) for width, height in level)

@@ -39,8 +39,9 @@ class TrainConfig:
         litepan: With LitePAN's two paths.
         spp: With spatial pyramid pooling.
         anchors: (width, height) in input pixels, three a level; the default ones if left out.
-        auto_anchor: Fit the anchors to the training boxes by k-means, unless ``anchors`` are given (published code: on,
-            with width and height swapped).
+        auto_anchor: Fit the anchors to the training boxes by k-means, unless ``anchors`` are given.
+        anchor_recall: ... unless so great a share of the boxes has a default anchor already; above 1 for always.
+        swapped_anchors: Fit them with width and height swapped, always, as the published code does.
         init: Weight file to start from (or a shipped name); what fits by name and shape is taken over.
         freeze: Parts that stay as they are, for example encoder, or encoder.level1.
         teacher: Weight file of a network to distil from, of any variant, with the same classes; or a folder of any
@@ -105,6 +106,8 @@ class TrainConfig:
     spp: bool = True
     anchors: Anchors | None = None
     auto_anchor: bool = False
+    anchor_recall: float = 0.98
+    swapped_anchors: bool = False
     init: str | None = None
     freeze: tuple[str, ...] = ()
     teacher: str | None = None

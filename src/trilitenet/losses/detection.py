@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -160,6 +160,10 @@ def ignored_cells(ignored: Tensor, images: int, grid: tuple[int, int], stride: i
     return hits.index_add_(0, ignored[:, 0].long(), inside) > 0
 
 
+_SINGLE_CLASS_SHARE: Final = 1 / 80
+"""Of the class term's gain where there is one class (YOLOv5 scales the gain by classes / 80)."""
+
+
 class DetectionLoss(nn.Module):
     """L_det = 0.05 box + 1.0 objectness + 0.5 class, summed over three levels.
 
@@ -176,7 +180,8 @@ class DetectionLoss(nn.Module):
         balance: Of the objectness of 1/8, 1/16 and 1/32.
         ratio_limit: See `match`.
         single_class_loss: Train the class score also when there is one class (the published code does not, which
-            leaves it as it was initialised).
+            leaves it as it was initialised). All its targets are 1, which says nothing of the image, so the term has
+            1/80 of its weight then: at full weight it takes from the objectness (docs/training.md).
         label_smoothing: Class targets are 1 - s/2 and s/2, s in [0, 1).
         strides: Input pixels a cell, a level.
     """
@@ -270,4 +275,4 @@ class DetectionLoss(nn.Module):
         truth = F.one_hot(found.class_id, self.classes).to(output.dtype) * (1 - smooth) + smooth / 2
         entropy = F.binary_cross_entropy_with_logits(chosen[:, 5:], truth, reduction="none")
         classification = (entropy.mean(dim=1) * weight).sum() / number
-        return box, objectness, classification
+        return box, objectness, classification * (_SINGLE_CLASS_SHARE if self.classes == 1 else 1.0)
