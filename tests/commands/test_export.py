@@ -125,4 +125,4 @@ def test_int8(
     assert done.parity is not None
     text = path.read_bytes()
     assert (b"FakeQuantize" if format_ == "openvino" else b"QuantizeLinear") in text
-    assert "in floating point: difference, heads" in done.summary()
+    assert "in floating point: difference, detection, c4, c5" in done.summary()
