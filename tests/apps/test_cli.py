@@ -132,3 +132,29 @@ def test_python_m_is_the_command() -> None:
     done = subprocess.run([sys.executable, "-m", "trilitenet", "--version"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0
     assert done.stdout.startswith("trilitenet ")
+
+
+def test_several_values_may_follow_one_option() -> None:
+    words = [
+        "benchmark",
+        "--batch",
+        "1",
+        "8",
+        "tiny",
+        "8.onnx",
+        "--backend",
+        "torch",
+        "onnxruntime",
+        "--rounds",
+        "2",
+        "3",
+    ]
+    assert cli._repeated(words) == [
+        *["benchmark", "--batch", "1", "--batch", "8", "tiny", "8.onnx"],
+        *["--backend", "torch", "--backend", "onnxruntime", "--rounds", "2", "3"],
+    ]
+    assert cli._repeated(["evaluate-table", "--precisions", "fp32", "int8", "tiny"])[-3:] == [
+        "--precisions",
+        "int8",
+        "tiny",
+    ]

@@ -15,6 +15,7 @@ import ast
 import importlib
 import logging
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -121,6 +122,30 @@ def build_app(words: Sequence[str] = (), *, everything: bool = False) -> cyclopt
     return app
 
 
+_LISTS: Final = {
+    "--backend": "auto|torch|onnxruntime|openvino|tensorrt|ncnn",
+    "--batch": r"\d+",
+    "--precisions": "fp32|fp16|bf16|int8",
+    "--resolution": r"\d+",
+    "--severities": r"\d+",
+}
+"""Options that take several values, and what a value looks like, so that no file or model is taken for one."""
+
+
+def _repeated(words: Sequence[str]) -> list[str]:
+    """Return ``--batch 1 8`` as ``--batch 1 --batch 8``, the form that the parser takes."""
+    spread: list[str] = []
+    option = ""
+    for word in words:
+        further = bool(option) and re.fullmatch(_LISTS[option], word) is not None
+        if further and spread[-1] != option:
+            spread.append(option)
+        elif not further:
+            option = word if word in _LISTS else ""
+        spread.append(word)
+    return spread
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Run the command line.
 
@@ -138,6 +163,7 @@ def main(words: Sequence[str] | None = None) -> int:
     )
     try:
         _check_command(words)
+        words = _repeated(words)
         app = build_app(words)
         result = app(words, print_error=False, exit_on_error=False, verbose=False, result_action="return_value")
         sys.stdout.write(_shown(result))
