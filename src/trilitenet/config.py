@@ -246,6 +246,11 @@ class ArtefactInfo:
     trilitenet: str = ""
     schema: int = ARTEFACT_SCHEMA
 
+    @property
+    def decides_masks(self) -> bool:
+        """Whether the thresholds of masks are inside and cannot be changed any more."""
+        return self.masks != "probability"
+
     def to_json(self) -> str:
         """Return the description as one line of JSON."""
         return json.dumps(dataclasses.asdict(self))

@@ -3,6 +3,7 @@ from __future__ import annotations
 import inspect
 import subprocess
 import sys
+from typing import get_args
 
 import pytest
 
@@ -158,3 +159,11 @@ def test_several_values_may_follow_one_option() -> None:
         "int8",
         "tiny",
     ]
+
+
+def test_the_values_that_may_follow_are_those_that_there_are() -> None:
+    from trilitenet.commands.export import Precision
+    from trilitenet.commands.load import BACKENDS
+
+    assert set(cli._LISTS["--backend"].split("|")) == set(BACKENDS)
+    assert set(cli._LISTS["--precisions"].split("|")) == set(get_args(Precision))

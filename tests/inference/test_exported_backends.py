@@ -19,6 +19,7 @@ from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
 from trilitenet.errors import BackendError, ConfigError, ShapeError, WeightsError
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.exported import prepare_input, read_metadata
+from trilitenet.inference.ncnn_backend import NcnnBackend
 from trilitenet.inference.onnx_backend import OnnxBackend
 from trilitenet.inference.openvino_backend import OpenVINOBackend
 from trilitenet.inference.tensorrt_backend import pack_engine, unpack_engine
@@ -60,8 +61,14 @@ def test_equals_the_network(
     backend.close()
 
 
-@pytest.mark.parametrize(("name", "kind"), [("model.onnx", OnnxBackend), ("model.xml", OpenVINOBackend)])
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("model.onnx", OnnxBackend), ("model.xml", OpenVINOBackend), ("model.ncnn.param", NcnnBackend)],
+)
 def test_in_parallel_gives_the_same(artefacts: Artefacts, name: str, kind: Any) -> None:
+    if kind is NcnnBackend:
+        pytest.importorskip("pnnx")
+        pytest.importorskip("ncnn")
     backend = kind(artefacts.folder / name, threads=3)
     images = [artefacts.images[index % len(artefacts.images)][None] for index in range(12)]
     alone = [backend.run(image) for image in images]
@@ -70,6 +77,8 @@ def test_in_parallel_gives_the_same(artefacts: Artefacts, name: str, kind: Any) 
         together = list(pool.map(backend.run, images))
     for one, other, after in zip(alone, together, map(backend.run, images), strict=True):
         for got in (other, after):
+            assert one.detection is not None
+            assert got.detection is not None
             np.testing.assert_allclose(got.detection, one.detection, rtol=1e-3, atol=1e-3)
             assert np.mean(got.lane == one.lane) > 0.999
 

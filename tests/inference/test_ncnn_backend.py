@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -62,21 +61,6 @@ def test_equals_the_network(artefacts: Artefacts) -> None:
     backend.close()
     with pytest.raises(BackendError, match="closed"):
         backend.run(artefacts.images)
-
-
-def test_in_parallel_gives_the_same(artefacts: Artefacts) -> None:
-    backend = NcnnBackend(artefacts.folder / "model.ncnn.param", threads=3)
-    images = [artefacts.images[index % len(artefacts.images)][None] for index in range(12)]
-    alone = [backend.run(image) for image in images]
-    with backend.in_parallel() as runners, ThreadPoolExecutor(runners) as pool:
-        assert runners == 3
-        together = list(pool.map(backend.run, images))
-    for one, other, after in zip(alone, together, map(backend.run, images), strict=True):
-        for got in (other, after):
-            assert one.detection is not None
-            assert got.detection is not None
-            np.testing.assert_allclose(got.detection, one.detection, rtol=1e-3, atol=1e-3)
-            assert np.mean(got.lane == one.lane) > 0.999
 
 
 def test_load_finds_it(artefacts: Artefacts, copied: Path) -> None:

@@ -20,6 +20,7 @@ import trilitenet
 from trilitenet.commands.load import load
 from trilitenet.config import VARIANTS
 from trilitenet.errors import ConfigError, OutputError, import_extra
+from trilitenet.inference.backend import usable_cores
 from trilitenet.inference.predictor import Predictor
 
 __all__ = ["Benchmark", "Cost", "Timing", "benchmark"]
@@ -303,7 +304,7 @@ def _machine(threads: int | None, streams: int) -> dict[str, str]:
         pass
     return {
         "processor": f"{processor} ({flags})" if flags else processor,
-        "cores": str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()),
+        "cores": str(usable_cores()),
         "threads": "the runtime's choice" if threads is None else str(threads),
         "streams": str(streams),
         "system": platform.platform(terse=True),

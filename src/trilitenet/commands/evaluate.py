@@ -150,7 +150,7 @@ def _check_artefact(model: str, predictor: Predictor, protocol: str) -> None:
             "average precision needs them: export it without --nms"
         )
     thresholds = predictor.card.thresholds
-    if protocol != "fair" and info.masks != "probability" and not thresholds.drivable == thresholds.lane == 0.5:
+    if protocol != "fair" and info.decides_masks and not thresholds.drivable == thresholds.lane == 0.5:
         raise ConfigError(
             f"{model} decides masks inside, by thresholds of its own; the 'paper' protocol takes the likelier class: "
             "export it with --masks probability"

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Literal
 
 from trilitenet.commands.evaluate import evaluate, hash_dataset, hash_model
-from trilitenet.commands.export import export
+from trilitenet.commands.export import PRECISIONS, SUFFIXES, Precision, export
+from trilitenet.commands.tables import markdown_row
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.report import Report, read_report
 from trilitenet.errors import ConfigError, OutputError
 
 __all__ = ["PrecisionRow", "PrecisionTable", "evaluate_table"]
-
-Precision = Literal["fp32", "fp16", "bf16", "int8"]
 
 _PAPER: Final = {
     "paper/detection/recall": "Recall (%)",
@@ -61,9 +60,12 @@ class PrecisionTable:
 
     rows: tuple[PrecisionRow, ...]
 
+    def _first(self, row: PrecisionRow) -> PrecisionRow:
+        return next(one for one in self.rows if one.model == row.model)
+
     def drop(self, row: PrecisionRow) -> tuple[float, str]:
         """Return by how many points a row is at most below the first row of its model, and in which figure."""
-        first = next(one for one in self.rows if one.model == row.model)
+        first = self._first(row)
         lost = {key: 100 * (first.figures[key] - row.figures[key]) for key in (*_PAPER, *_FAIR) if key in row.figures}
         worst = max(lost, key=lambda key: lost[key])
         return lost[worst], worst
@@ -80,9 +82,10 @@ class PrecisionTable:
 
     def _table(self, columns: dict[str, str]) -> list[str]:
         known = {key: title for key, title in columns.items() if any(key in row.figures for row in self.rows)}
-        lines = [_line(("Model", "Precision", "Runs as", *known.values())), _line(["---"] * (3 + len(known)))]
+        head = ("Model", "Precision", "Runs as", *known.values())
+        lines = [markdown_row(head), markdown_row(["---"] * len(head))]
         for row in self.rows:
-            first = next(one for one in self.rows if one.model == row.model)
+            first = self._first(row)
             cells = []
             for key in known:
                 if key not in row.figures:
@@ -90,7 +93,7 @@ class PrecisionTable:
                     continue
                 points = 100 * (row.figures[key] - first.figures[key])
                 cells.append(f"{100 * row.figures[key]:.2f}" + ("" if row is first else f" ({points:+.2f})"))
-            lines.append(_line((row.model, row.precision, row.runtime, *cells)))
+            lines.append(markdown_row((row.model, row.precision, row.runtime, *cells)))
         return lines
 
 
@@ -135,8 +138,11 @@ def evaluate_table(
     """
     if not precisions:
         raise ConfigError("name at least one of --precisions fp32 fp16 bf16 int8")
-    if format == "onnx" and "bf16" in precisions:
-        raise ConfigError("onnx artefacts come as fp32, fp16, int8; leave bf16 out of --precisions")
+    for precision in precisions:
+        if precision not in PRECISIONS[format]:
+            raise ConfigError(
+                f"{format} artefacts come as {', '.join(PRECISIONS[format])}; leave {precision} out of --precisions"
+            )
     data_hash = hash_dataset(DrivingDataset(data, split), limit)
     rows: list[PrecisionRow] = []
     for model in models or ("tiny", "small", "base"):
@@ -145,7 +151,7 @@ def evaluate_table(
             name = f"{Path(model).stem}-{stamp}-{size}-{precision}"
             if precision == "int8":
                 name += f"-{calibration_frames}" + ("" if max_drop is None else f"-drop{max_drop:g}")
-            artefact = output / f"{name}{'.xml' if format == 'openvino' else '.onnx'}"
+            artefact = output / f"{name}{SUFFIXES[format]}"
             report = None if overwrite else _done(output / name / "report.json", artefact, data_hash)
             if report is None:
                 if overwrite or not artefact.exists():
@@ -191,7 +197,3 @@ def _done(path: Path, artefact: Path, data_hash: dict[str, str]) -> Report | Non
     report = read_report(path)
     same = report.provenance.model_sha256 == hash_model(str(artefact)) and report.provenance.data_sha256 == data_hash
     return report if same else None
-
-
-def _line(cells: Iterable[str]) -> str:
-    return "| " + " | ".join(cells) + " |"

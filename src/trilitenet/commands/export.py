@@ -37,19 +37,20 @@ from trilitenet.processing.images import read_image
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.structures import RawOutputs
 
-__all__ = ["Exported", "export"]
+__all__ = ["PRECISIONS", "SUFFIXES", "Exported", "Precision", "export"]
 
 Format = Literal["onnx", "openvino", "ncnn", "tensorrt", "torch", "triton"]
 Precision = Literal["fp32", "fp16", "bf16", "int8"]
 
-_SUFFIXES = {
+SUFFIXES = {
     "onnx": ".onnx",
     "openvino": ".xml",
     "ncnn": ".ncnn.param",
     "tensorrt": ".engine",
     "torch": ".pt2",
 }
-_PRECISIONS = {
+"""What the file of a format ends with."""
+PRECISIONS = {
     "onnx": ("fp32", "fp16", "int8"),
     "openvino": ("fp32", "fp16", "bf16", "int8"),
     "ncnn": ("fp32", "fp16"),
@@ -57,6 +58,7 @@ _PRECISIONS = {
     "torch": ("fp32",),
     "triton": ("fp32", "fp16", "int8"),
 }
+"""Precisions of a format."""
 _IMAGES = {".bmp", ".jpeg", ".jpg", ".png", ".webp"}
 
 
@@ -139,8 +141,8 @@ def export(
         OutputError: If the artefact exists, or cannot be written.
         BackendError: If the comparison fails.
     """
-    if precision not in _PRECISIONS[format]:
-        raise ConfigError(f"{format} artefacts come as {', '.join(_PRECISIONS[format])}, not {precision}")
+    if precision not in PRECISIONS[format]:
+        raise ConfigError(f"{format} artefacts come as {', '.join(PRECISIONS[format])}, not {precision}")
     if nms and format not in ("onnx", "openvino", "triton"):
         raise ConfigError("--nms is for onnx, openvino and triton")
     if precision == "int8" and calibration is None:
@@ -184,9 +186,9 @@ def export(
             )
         serve = f"Serve it with: tritonserver --model-repository {repository.resolve()}"
         return dataclasses.replace(exported, path=path, notes=(*exported.notes, serve))
-    path = output or Path(f"{Path(model).stem}{_SUFFIXES[format]}")
-    if not path.name.endswith(_SUFFIXES[format]) and format != "tensorrt":
-        raise ConfigError(f"{format} artefacts end with {_SUFFIXES[format]}, not {path.suffix or 'nothing'}")
+    path = output or Path(f"{Path(model).stem}{SUFFIXES[format]}")
+    if not path.name.endswith(SUFFIXES[format]) and format != "tensorrt":
+        raise ConfigError(f"{format} artefacts end with {SUFFIXES[format]}, not {path.suffix or 'nothing'}")
     if path.exists() and not overwrite:
         raise OutputError(f"{path}: exists already; give another --output or --overwrite")
 

@@ -70,7 +70,7 @@ def load(
         raise ConfigError(f"unknown backend {backend!r}{did_you_mean(backend, BACKENDS)}")
     runtime = _open(model, device, backend, streams, threads)
     info: ArtefactInfo | None = getattr(runtime, "info", None)
-    if info is not None and info.masks != "probability" and (drivable is not None or lane is not None):
+    if info is not None and info.decides_masks and (drivable is not None or lane is not None):
         raise ConfigError(
             f"{model} decides masks inside, by the thresholds of the model it was exported from; "
             "for others export it with --masks probability"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import math
 import re
 import sys
 from collections.abc import Iterator, Mapping
@@ -160,7 +161,7 @@ def _network(config: TrainConfig, dataset: SampleSource, display: _Display, *, r
     if config.auto_anchor and anchors is None and "detection" in config.tasks and not resume:
         swapped = config.swapped_anchors
         sizes = box_sizes(dataset, config.input_size, seed=config.seed, swapped=swapped)
-        enough = 2.0 if swapped else config.anchor_recall
+        enough = math.inf if swapped else config.anchor_recall
         fit = fit_anchors(sizes, DEFAULT_ANCHORS, enough=enough, seed=config.seed)
         display.line(fit.summary())
         anchors = fit.anchors

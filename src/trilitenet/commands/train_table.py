@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import yaml
 
+from trilitenet.commands.tables import markdown_row
 from trilitenet.commands.train import train
 from trilitenet.engine.train import CHECKPOINT_NAME
 from trilitenet.errors import ConfigError
@@ -62,13 +63,13 @@ class TableResult:
         lines = [
             self.title if self.finished else f"{self.title} (stopped; go on with --resume)",
             "",
-            _line(head),
-            _line(["---"] * len(head)),
+            markdown_row(head),
+            markdown_row(["---"] * len(head)),
         ]
         for row in self.rows:
             cells = [f"{100 * row.figures[name]:.1f}" if name in row.figures else "-" for name in _FIGURES]
             cost = (f"{row.parameters / 1e6:.2f}", f"{row.multiply_adds / 1e9:.2f}")
-            lines.append(_line([row.name, *cells, *cost]))
+            lines.append(markdown_row([row.name, *cells, *cost]))
         return "\n".join(lines)
 
 
@@ -115,7 +116,3 @@ def _read(table: Path) -> tuple[str, dict[str, Path]]:
         return str(content["title"]), rows
     except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{table}: must hold a title and rows of 'name: recipe' ({error!r})") from error
-
-
-def _line(cells: Any) -> str:
-    return "| " + " | ".join(cells) + " |"

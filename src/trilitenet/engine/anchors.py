@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -99,7 +100,7 @@ def fit_anchors(
     *,
     ratio_limit: float = 4.0,
     min_side: float = 2.0,
-    enough: float = 2.0,
+    enough: float = math.inf,
     seed: int = 0,
 ) -> AnchorFit:
     """Fit nine anchors by k-means, and keep the old ones where they suit no worse, or well enough.

@@ -148,7 +148,7 @@ class Scorecard:
         for protocol, metric in metrics.items():
             if metric is None:
                 continue
-            plain = metric.figures()
+            plain = metric.figures()  # before the resampling, whose threads would each rank the boxes first
             spread = bootstrap(metric.figures, count, resamples, seed)
             for name, value in plain.items():
                 low, high = interval(spread[name]) if resamples else (None, None)

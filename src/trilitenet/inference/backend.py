@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from typing import Final, Protocol, runtime_checkable
+from collections.abc import Iterator
+from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +13,7 @@ from numpy.typing import NDArray
 from trilitenet.config import ModelCard
 from trilitenet.structures import RawOutputs
 
-__all__ = ["MOST_PARALLEL", "Backend", "usable_cores"]
+__all__ = ["MOST_PARALLEL", "Backend", "ParallelSessions", "usable_cores"]
 
 MOST_PARALLEL: Final = 4
 """At most so many images are computed at once where a backend trades latency for images a second."""
@@ -20,6 +22,32 @@ MOST_PARALLEL: Final = 4
 def usable_cores() -> int:
     """Return on how many processor cores this process may run."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class ParallelSessions:
+    """Trades latency for images a second, on a runtime whose sessions several threads may use at once."""
+
+    _session: Any
+    _threads: int | None
+    _device: str
+
+    def _open(self, threads: int | None) -> Any:
+        """Return a session of so many threads; the runtime's own choice if left out."""
+        raise NotImplementedError
+
+    @contextlib.contextmanager
+    def in_parallel(self) -> Iterator[int]:
+        """Inside, images share no cores; yields from how many threads `run` is best called."""
+        cores = self._threads or usable_cores()
+        count = min(MOST_PARALLEL, cores) if self._device == "cpu" else 1
+        if count == 1:
+            yield 1
+            return
+        before, self._session = self._session, self._open(cores // count)
+        try:
+            yield count
+        finally:
+            self._session = before
 
 
 @runtime_checkable

@@ -86,7 +86,7 @@ def run_images(
 
 def _probability(mask: NDArray[Any], info: ArtefactInfo) -> NDArray[np.uint8]:
     """Return a mask as probability x 255; a decided one has 0 and 255."""
-    if info.masks == "probability":
+    if not info.decides_masks:
         return np.asarray(mask, np.uint8)
     decided = mask if info.masks == "decision" else (mask > 0).astype(np.uint8)
     return np.asarray(np.multiply(decided, np.uint8(255), dtype=np.uint8))

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import WEIGHTS_HASH_KEY, ArtefactInfo, ModelCard
 from trilitenet.errors import BackendError, ConfigError, WeightsError, import_extra
-from trilitenet.inference.backend import MOST_PARALLEL, usable_cores
+from trilitenet.inference.backend import ParallelSessions
 from trilitenet.inference.exported import prepare_input, read_metadata, run_images
 from trilitenet.structures import RawOutputs
 
@@ -24,7 +23,7 @@ __all__ = ["NcnnBackend"]
 _MAGIC: Final = b"7767517"
 
 
-class NcnnBackend:
+class NcnnBackend(ParallelSessions):
     """An artefact of ``trilitenet export --format ncnn`` on NCNN, on the CPU.
 
     Args:
@@ -62,7 +61,8 @@ class NcnnBackend:
         self._card, self.info = _read(self._path)
         wanted = precision or self.info.precision
         self.precision = "fp16" if wanted == "fp16" and self._ncnn.cpu_support_arm_asimdhp() else "fp32"
-        self._net: Any = self._open(threads)
+        self._device = "cpu"
+        self._session: Any = self._open(threads)
 
     def _open(self, threads: int | None) -> Any:
         net = self._ncnn.Net()
@@ -94,7 +94,7 @@ class NcnnBackend:
 
     def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
         """Run the network on (B, H, W, 3) uint8 RGB, image by image; see `Backend.run`."""
-        net = self._net
+        net = self._session
         if net is None:
             raise BackendError(f"{self._path}: the model was closed")
         return run_images(batch, self._card, lambda: [self._run(net, image) for image in batch], self.info)
@@ -113,23 +113,9 @@ class NcnnBackend:
                 results[task] = values.reshape(1, *values.shape[-2:])  # pnnx 20250530 leaves masks a third axis
         return results
 
-    @contextlib.contextmanager
-    def in_parallel(self) -> Iterator[int]:
-        """Inside, images share no cores; yields from how many threads `run` is best called."""
-        cores = self._threads or usable_cores()
-        count = min(MOST_PARALLEL, cores)
-        if count == 1:
-            yield 1
-            return
-        before, self._net = self._net, self._open(cores // count)
-        try:
-            yield count
-        finally:
-            self._net = before
-
     def close(self) -> None:
         """Free the network."""
-        self._net = None
+        self._session = None
 
 
 def _find(path: Path) -> Path:

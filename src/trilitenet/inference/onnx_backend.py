@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +12,14 @@ from numpy.typing import NDArray
 
 from trilitenet.config import ModelCard
 from trilitenet.errors import BackendError, WeightsError, import_extra
-from trilitenet.inference.backend import MOST_PARALLEL, usable_cores
+from trilitenet.inference.backend import ParallelSessions
 from trilitenet.inference.exported import prepare_input, read_metadata, run_images
 from trilitenet.structures import RawOutputs
 
 __all__ = ["OnnxBackend"]
 
 
-class OnnxBackend:
+class OnnxBackend(ParallelSessions):
     """An artefact of ``trilitenet export --format onnx`` on ONNX Runtime.
 
     Args:
@@ -101,20 +100,6 @@ class OnnxBackend:
             ]
 
         return run_images(batch, self._card, outputs, self.info)
-
-    @contextlib.contextmanager
-    def in_parallel(self) -> Iterator[int]:
-        """Inside, images share no cores; yields from how many threads `run` is best called."""
-        cores = self._threads or usable_cores()
-        count = min(MOST_PARALLEL, cores) if self._device == "cpu" else 1
-        if count == 1:
-            yield 1
-            return
-        before, self._session = self._session, self._open(cores // count)
-        try:
-            yield count
-        finally:
-            self._session = before
 
     def close(self) -> None:
         """Nothing to free before the object goes."""

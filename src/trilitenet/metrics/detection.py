@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from trilitenet.errors import ShapeError
 from trilitenet.metrics.arithmetic import box_area, box_cover, box_overlap, mean_known, ratio
 from trilitenet.metrics.ranking import RankedBoxes, RankedSums
-from trilitenet.metrics.rows import Rows
+from trilitenet.metrics.rows import Rows, pack_tables, unpack_tables
 
 __all__ = ["AREAS", "IOU_THRESHOLDS", "DetectionCurve", "DetectionMetric", "DetectionScores", "OperatingPoint"]
 
@@ -438,19 +438,24 @@ class DetectionMetric:
             recall_all=float(curve.recall[-1]) if len(curve.recall) else (0.0 if objects.sum() else float("nan")),
         )
 
+    def _tables(self) -> dict[str, Rows]:
+        return {
+            "scores": self._scores,
+            "image": self._image,
+            "class_id": self._class,
+            "matched": self._matched,
+            "ignored": self._ignored,
+            "objects": self._objects,
+            "labelled": self._labelled,
+        }
+
     def state(self) -> dict[str, Any]:
         """Return what was kept, as ``json.dumps`` takes it."""
         return {
             "class_names": list(self.class_names),
             "confidence": self.confidence,
             "max_boxes": self.max_boxes,
-            "scores": self._scores.pack(),
-            "image": self._image.pack(),
-            "class_id": self._class.pack(),
-            "matched": self._matched.pack(),
-            "ignored": self._ignored.pack(),
-            "objects": self._objects.pack(),
-            "labelled": self._labelled.pack(),
+            **pack_tables(self._tables()),
             "confusion": self._confusion.tolist(),
         }
 
@@ -458,13 +463,7 @@ class DetectionMetric:
     def from_state(cls, state: dict[str, Any]) -> DetectionMetric:
         """Read what `state` returned."""
         metric = cls(state["class_names"], state["confidence"], state["max_boxes"])
-        metric._scores.unpack(state["scores"])
-        metric._image.unpack(state["image"])
-        metric._class.unpack(state["class_id"])
-        metric._matched.unpack(state["matched"])
-        metric._ignored.unpack(state["ignored"])
-        metric._objects.unpack(state["objects"])
-        metric._labelled.unpack(state["labelled"])
+        unpack_tables(metric._tables(), state)
         metric._confusion = np.asarray(state["confusion"], np.int64)
         return metric
 

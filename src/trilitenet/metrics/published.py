@@ -29,7 +29,7 @@ from trilitenet.errors import ConfigError, ShapeError
 from trilitenet.metrics.arithmetic import box_overlap, mean_known, ratio, weighted_sum
 from trilitenet.metrics.detection import IOU_THRESHOLDS
 from trilitenet.metrics.ranking import RankedBoxes, RankedSums
-from trilitenet.metrics.rows import Rows
+from trilitenet.metrics.rows import Rows, pack_tables, unpack_tables
 from trilitenet.metrics.segmentation import as_binary, confusion
 
 __all__ = [
@@ -346,28 +346,28 @@ class PublishedDetection:
             **{name: float(value[0]) for name, value in self.figures().items()},
         )
 
+    def _tables(self) -> dict[str, Rows]:
+        return {
+            "scores": self._scores,
+            "image": self._image,
+            "class_id": self._class,
+            "right": self._right,
+            "objects": self._objects,
+            "labelled": self._labelled,
+        }
+
     def state(self) -> dict[str, Any]:
         """Return what was kept, as ``json.dumps`` takes it."""
         return {
             "classes": self.classes,
-            "scores": self._scores.pack(),
-            "image": self._image.pack(),
-            "class_id": self._class.pack(),
-            "right": self._right.pack(),
-            "objects": self._objects.pack(),
-            "labelled": self._labelled.pack(),
+            **pack_tables(self._tables()),
         }
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> PublishedDetection:
         """Read what `state` returned."""
         metric = cls(state["classes"])
-        metric._scores.unpack(state["scores"])
-        metric._image.unpack(state["image"])
-        metric._class.unpack(state["class_id"])
-        metric._right.unpack(state["right"])
-        metric._objects.unpack(state["objects"])
-        metric._labelled.unpack(state["labelled"])
+        unpack_tables(metric._tables(), state)
         return metric
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import base64
 import zlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-__all__ = ["Rows"]
+__all__ = ["Rows", "pack_tables", "unpack_tables"]
 
 
 class Rows:
@@ -64,3 +65,19 @@ class Rows:
     def clear(self) -> None:
         """Drop all rows."""
         self._used = 0
+
+
+def pack_tables(tables: Mapping[str, Rows]) -> dict[str, str]:
+    """Return what `Rows.pack` makes of each table, by name."""
+    return {name: rows.pack() for name, rows in tables.items()}
+
+
+def unpack_tables(tables: Mapping[str, Rows], state: Mapping[str, Any]) -> None:
+    """Fill tables with what `pack_tables` made of them.
+
+    Raises:
+        KeyError: If one is missing.
+        ValueError: If one is no packed table.
+    """
+    for name, rows in tables.items():
+        rows.unpack(state[name])

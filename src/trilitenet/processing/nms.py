@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from trilitenet.processing.boxes import box_iou
+
 __all__ = ["nms"]
 
 _BLOCK: Final = 512
@@ -41,7 +43,8 @@ def nms(
             break
         block = np.arange(start, min(start + _BLOCK, len(order)))
         if len(kept):
-            block = block[~_suppressed(boxes[block], classes[block], boxes[kept], classes[kept], iou)]
+            over = (box_iou(boxes[block], boxes[kept]) > iou) & (classes[block, None] == classes[kept])
+            block = block[~over.any(axis=1)]
         kept = np.concatenate([kept, block[_greedy(boxes[block], classes[block], iou)]])
     return order[kept[:max_boxes]].astype(np.int64, copy=False)
 
@@ -57,22 +60,3 @@ def _greedy(boxes: NDArray[np.float64], classes: NDArray[np.int32], iou: float) 
     else:
         stays = cv2.dnn.NMSBoxesBatched(rectangles, rank, classes, 0.0, iou)  # type: ignore[arg-type]
     return np.asarray(stays, np.int64).reshape(-1)
-
-
-def _suppressed(
-    boxes: NDArray[np.float64],
-    classes: NDArray[np.int32],
-    better: NDArray[np.float64],
-    better_classes: NDArray[np.int32],
-    iou: float,
-) -> NDArray[np.bool_]:
-    """Return (N,) whether each box overlaps one of the better ones of its class by more than ``iou``."""
-    left, top, right, bottom = np.ascontiguousarray(boxes.T)[:, :, None]
-    better_left, better_top, better_right, better_bottom = np.ascontiguousarray(better.T)
-    width = np.minimum(right, better_right) - np.maximum(left, better_left)
-    height = np.minimum(bottom, better_bottom) - np.maximum(top, better_top)
-    shared = np.maximum(width, 0) * np.maximum(height, 0)
-    area, better_area = (right - left) * (bottom - top), (better_right - better_left) * (better_bottom - better_top)
-    over = shared > iou * (area + better_area - shared)
-    gone: NDArray[np.bool_] = (over & (classes[:, None] == better_classes[None])).any(axis=1)
-    return gone
