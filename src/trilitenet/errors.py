@@ -33,6 +33,7 @@ __all__ = [
     "TrainingError",
     "TriLiteNetError",
     "WeightsError",
+    "brief",
     "did_you_mean",
     "import_extra",
 ]
@@ -76,6 +77,11 @@ class BackendError(TriLiteNetError, RuntimeError):
 
 class TrainingError(TriLiteNetError, RuntimeError):
     """A training run that cannot go on."""
+
+
+def brief(error: BaseException) -> str:
+    """Return an error's kind and words for a message: its ``repr``, which of a decoding error is the whole file."""
+    return f"{type(error).__name__}: {error}" if isinstance(error, UnicodeError) else repr(error)
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -142,3 +142,12 @@ def test_an_artefact_that_suppresses_boxes_is_not_measured(artefacts: Artefacts,
     onnx.save(model, str(tmp_path / "nms.onnx"))
     with pytest.raises(ConfigError, match="without --nms"):
         evaluate(str(tmp_path / "nms.onnx"), data=data)
+
+
+def test_a_file_of_bytes_is_no_report_in_one_short_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "weights.bin").write_bytes(b"\x01\x00\x00\x00\xff\xff\xff\xff" * 10_000)
+    assert main(["compare", str(tmp_path / "weights.bin"), str(tmp_path / "weights.bin")]) == 1
+    message = capsys.readouterr().err
+    assert "not a report" in message
+    assert "UnicodeDecodeError" in message
+    assert len(message) < 400 + len(str(tmp_path))

@@ -11,7 +11,7 @@ import yaml
 from trilitenet.commands.tables import markdown_row
 from trilitenet.commands.train import train
 from trilitenet.engine.train import CHECKPOINT_NAME
-from trilitenet.errors import ConfigError
+from trilitenet.errors import ConfigError, brief
 from trilitenet.models.cost import count_multiply_adds, count_parameters
 from trilitenet.models.weights import load_network
 
@@ -115,4 +115,4 @@ def _read(table: Path) -> tuple[str, dict[str, Path]]:
         rows = {str(name): table.parent / str(recipe) for name, recipe in content["rows"].items()}
         return str(content["title"]), rows
     except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
-        raise ConfigError(f"{table}: must hold a title and rows of 'name: recipe' ({error!r})") from error
+        raise ConfigError(f"{table}: must hold a title and rows of 'name: recipe' ({brief(error)})") from error

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from trilitenet.config import Task
 from trilitenet.data.description import DatasetDescription, MaskMeaning, class_table, read_description
 from trilitenet.data.sample import Sample
-from trilitenet.errors import DataError
+from trilitenet.errors import DataError, brief
 
 __all__ = [
     "DETECTION_FOLDER",
@@ -151,7 +151,7 @@ def parse_annotation(
                     class_id.append(table[category])
         attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(f"{name}: not an annotation in the per-image form ({error!r})") from error
+        raise DataError(f"{name}: not an annotation in the per-image form ({brief(error)})") from error
     return (
         np.array(boxes, np.float32).reshape(-1, 4),
         np.array(class_id, np.int64),

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import TASKS, Task
-from trilitenet.errors import DataError, OutputError
+from trilitenet.errors import DataError, OutputError, brief
 from trilitenet.structures import Boxes, Perception
 
 __all__ = ["DETECTIONS_FILE", "PredictionWriter", "SavedPredictions"]
@@ -188,7 +188,7 @@ class SavedPredictions:
             if isinstance(error, DataError):
                 raise
             form = "a list of image_id, category_id, bbox, score"
-            raise DataError(f"{path}: not COCO results ({form}): {error!r}") from error
+            raise DataError(f"{path}: not COCO results ({form}): {brief(error)}") from error
         table = np.frombuffer(numbers, np.float64).reshape(-1, 7) if numbers else np.zeros((0, 7))
         table = table[np.lexsort((-table[:, 5], table[:, 0]))]
         parts = np.split(table, np.flatnonzero(np.diff(table[:, 0])) + 1) if len(table) else []

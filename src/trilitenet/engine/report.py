@@ -20,7 +20,7 @@ from rich.text import Text
 from trilitenet.engine.figures import CONDITION_FIGURES, HEADLINES, meaning
 from trilitenet.engine.page import percent
 from trilitenet.engine.scoring import FairMetrics, FairScores, PaperMetrics, PaperScores
-from trilitenet.errors import DataError, OutputError
+from trilitenet.errors import DataError, OutputError, brief
 
 __all__ = [
     "FEW_IMAGES",
@@ -421,7 +421,7 @@ def read_report(path: Path) -> Report:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         if isinstance(error, DataError):
             raise
-        raise DataError(f"{path}: not a report that `trilitenet evaluate` wrote ({error!r})") from error
+        raise DataError(f"{path}: not a report that `trilitenet evaluate` wrote ({brief(error)})") from error
 
 
 def _plots(mapping: Mapping[str, Any]) -> DetectionPlots:

@@ -28,7 +28,7 @@ from trilitenet.config import TASKS, Task
 from trilitenet.data.rasterise import flatten
 from trilitenet.data.reading import IMAGE_ENDINGS
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel
-from trilitenet.errors import DataError
+from trilitenet.errors import DataError, brief
 
 __all__ = ["BDD100K_SPLITS", "BddSource", "parse_labels", "read_bdd100k"]
 
@@ -215,7 +215,7 @@ def parse_labels(content: Any, image: Path, source: str, tasks: Collection[Task]
         for item in items:
             _parse_item(item, objects, areas, lanes, dropped)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(f"{source}: {image.stem}: {error!r} is not as BDD100K has it") from error
+        raise DataError(f"{source}: {image.stem}: {brief(error)} is not as BDD100K has it") from error
     attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
     return ImageRecord(
         name=image.stem,

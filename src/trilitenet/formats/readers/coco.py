@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from trilitenet.data.records import AreaLabel, CocoRuns, ImageRecord, LaneLabel, ListedRecords, ObjectLabel
-from trilitenet.errors import DataError
+from trilitenet.errors import DataError, brief
 from trilitenet.formats.readers.mapping import LabelMapping, Shapes, find_image, read_json
 
 __all__ = ["read_coco"]
@@ -98,7 +98,7 @@ def _read_file(path: Path, split: str, root: Path, mapping: LabelMapping) -> tup
                 )
             )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(f"{path}: not as COCO has it ({error!r})") from error
+        raise DataError(f"{path}: not as COCO has it ({brief(error)})") from error
     return records, missing
 
 

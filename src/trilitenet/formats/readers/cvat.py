@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ListedRecords, ObjectLabel, RowRuns
-from trilitenet.errors import DataError
+from trilitenet.errors import DataError, brief
 from trilitenet.formats.readers.mapping import LabelMapping, Shapes, find_image
 
 __all__ = ["read_cvat"]
@@ -82,7 +82,7 @@ def _read_file(path: Path, folder: Path, mapping: LabelMapping, records: dict[st
         try:
             objects, shapes, attributes, dropped = _read_image(element, mapping)
         except (KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{path}: image {name!r} is not as CVAT has it ({error!r})") from error
+            raise DataError(f"{path}: image {name!r} is not as CVAT has it ({brief(error)})") from error
         records[split].append(
             ImageRecord(
                 name=place.stem,

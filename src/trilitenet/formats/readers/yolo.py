@@ -17,7 +17,7 @@ from PIL import Image, UnidentifiedImageError
 from trilitenet.config import Task
 from trilitenet.data.reading import IMAGE_ENDINGS
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ObjectLabel
-from trilitenet.errors import DataError
+from trilitenet.errors import DataError, brief
 from trilitenet.formats.readers.mapping import LabelMapping, Shapes
 
 __all__ = ["YoloSource", "read_yolo"]
@@ -122,7 +122,7 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
         if not base.is_dir():
             base = path.parent
     except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(f"{path}: not a YOLO data file ({error!r})") from error
+        raise DataError(f"{path}: not a YOLO data file ({brief(error)})") from error
     images: dict[str, dict[str, Path]] = defaultdict(dict)
     for key, split in (("train", "train"), ("val", "val"), ("valid", "val"), ("test", "test")):
         places = content.get(key)
