@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import re
 import shutil
@@ -109,27 +110,31 @@ def test_accumulation_sees_the_same_images(scenes: Path, tmp_path: Path) -> None
     assert losses[0]["train/objectness"] == pytest.approx(losses[1]["train/objectness"], rel=0.05)
 
 
+@pytest.mark.parametrize("workers", [0, 1])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_saves_and_ends_cleanly(
-    scenes: Path, tmp_path: Path, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+    scenes: Path, tmp_path: Path, number: signal.Signals, workers: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = signal.getsignal(number)
+    before, others = signal.getsignal(number), set(multiprocessing.active_children())
     plain = CsvLogger.log
 
     def log(self: CsvLogger, values: Any, step: int) -> None:
         plain(self, values, step)
         if step == 3:
-            os.kill(os.getpid(), number)
+            helpers = set(multiprocessing.active_children()) - others
+            assert len(helpers) == workers
+            processes = [str(process) for process in (os.getpid(), *(helper.pid for helper in helpers))]
+            subprocess.run(["kill", f"-{number.value}", *processes], check=True)  # as a terminal or scheduler does
 
     monkeypatch.setattr(CsvLogger, "log", log)
-    result = train(**settings(scenes, tmp_path, max_steps=6))
+    result = train(**settings(scenes, tmp_path, max_steps=6, workers=workers))
     assert (result.finished, result.steps, result.exit_code) == (False, 3, 130)
     assert "--resume" in result.summary()
     assert state(tmp_path)["step"] == 3
     assert not result.weights.exists()
     assert signal.getsignal(number) == before
     monkeypatch.setattr(CsvLogger, "log", plain)
-    assert train(resume=True, **settings(scenes, tmp_path, max_steps=6)).finished
+    assert train(resume=True, **settings(scenes, tmp_path, max_steps=6, workers=workers)).finished
 
 
 def test_validation_keeps_the_best_and_the_page(scenes: Path, tmp_path: Path) -> None:

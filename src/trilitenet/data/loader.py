@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import multiprocessing
+import os
+import signal
+import threading
 from collections.abc import Iterator
 from typing import Any, Final
 
@@ -246,6 +249,21 @@ def build_loader(
 
 
 def _start_worker(worker: int) -> None:
-    """Keep a worker that was not forked to one core too."""
+    """Leave stopping to the process that trains, and keep a worker that was not forked to one core too.
+
+    Ctrl-C reaches every process of a terminal, a scheduler's SIGTERM every one of a job, but the training process needs
+    its workers until the step at hand is done and saved.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "sigwaitinfo"):
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+        threading.Thread(target=_heed_parent, daemon=True).start()
     if multiprocessing.get_start_method() != "fork":
         cv2.setNumThreads(0)
+
+
+def _heed_parent() -> None:
+    """End this process at its parent's SIGTERM, and at no other."""
+    while signal.sigwaitinfo({signal.SIGTERM}).si_pid != os.getppid():
+        pass
+    os._exit(0)
