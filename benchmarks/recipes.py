@@ -1,8 +1,8 @@
-"""The default switches against the published ones: same data, budget, seeds and device.
+"""The default recipe against the paper's constants and the published switches: same data, budget, seeds and device.
 
     python benchmarks/recipes.py --data DATA --output runs/recipes --epochs 20 --seeds 0 1 2
 
-Packs the training images once for each way at its own `mask_above`, trains both with each seed (runs that are done are
+Packs the training images once for each way at its own `mask_above`, trains each with each seed (runs that are done are
 kept, stopped ones go on), scores each run's weights on the validation split at full size by the evaluation command's
 own code ('fair' protocol), and prints mean and range of the five figures of the paper.
 """
@@ -24,7 +24,11 @@ from trilitenet.engine.train import CHECKPOINT_NAME
 from trilitenet.models.weights import load_network
 
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
-WAYS = {"default": RECIPES / "bdd100k_tiny.yaml", "published": RECIPES / "paper" / "published.yaml"}
+WAYS = {
+    "default": RECIPES / "default_tiny.yaml",
+    "paper": RECIPES / "bdd100k_tiny.yaml",
+    "published": RECIPES / "paper" / "published.yaml",
+}
 FIGURES = ("detection/recall", "detection/ap50", "drivable/miou", "lane/accuracy", "lane/iou")
 
 
@@ -63,6 +67,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", required=True)
     parser.add_argument("--output", type=Path, default=Path("runs/recipes"))
+    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS))
     parser.add_argument("--epochs", type=int, default=20)
     parser.add_argument("--warmup-epochs", type=float, default=None, help="min(3, a tenth of the epochs) if left out")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
@@ -72,9 +77,9 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     options = parser.parse_args()
     warmup = min(3.0, options.epochs / 10) if options.warmup_epochs is None else options.warmup_epochs
-    results: dict[str, list[dict[str, float]]] = {way: [] for way in WAYS}
+    results: dict[str, list[dict[str, float]]] = {way: [] for way in options.ways}
     for seed in options.seeds:
-        for way in WAYS:
+        for way in options.ways:
             settings: dict[str, Any] = {
                 "epochs": options.epochs,
                 "warmup_steps": 0,
@@ -88,7 +93,7 @@ def main() -> None:
             }
             results[way].append(run(options.data, way, options.output / f"{way}-{seed}", settings))
             print(f"{way} {seed}: {results[way][-1]}", flush=True)
-    print("| Figure | " + " | ".join(WAYS) + " |\n|---|" + "---|" * len(WAYS))
+    print("| Figure | " + " | ".join(results) + " |\n|---|" + "---|" * len(results))
     for name in FIGURES:
         cells = []
         for runs in results.values():

@@ -1,12 +1,16 @@
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
 import yaml
 
+from trilitenet.config import VARIANTS
 from trilitenet.engine.recipe import TrainConfig, merge, read_recipe
 from trilitenet.errors import ConfigError
+
+RECIPES = Path(__file__).resolve().parents[2] / "recipes"
 
 
 def test_file_then_overrides(tmp_path: Path) -> None:
@@ -69,8 +73,16 @@ def test_merge_goes_into_mappings() -> None:
     }
 
 
-def test_defaults_are_the_papers() -> None:
-    config = TrainConfig()
+def test_the_recipes_of_bdd100k_are_the_papers() -> None:
+    config = read_recipe(RECIPES / "bdd100k_tiny.yaml")
     assert (config.epochs, config.batch_size, config.lr, config.betas) == (200, 16, 0.001, (0.937, 0.999))
     assert (config.box_gains, config.task_weights) == ((0.05, 1.0, 0.5), (1.0, 0.3, 0.3))
     assert (config.drivable_tversky, config.lane_tversky, config.focal) == ((0.7, 0.3), (0.9, 0.1), (0.25, 2.0))
+
+
+@pytest.mark.parametrize("variant", list(VARIANTS))
+def test_the_default_recipes_depart_from_them_in_the_lanes_loss(variant: str) -> None:
+    ours, paper = (read_recipe(RECIPES / f"{name}_{variant}.yaml") for name in ("default", "bdd100k"))
+    assert ours.variant == variant
+    assert ours.lane_tversky == TrainConfig().lane_tversky == (0.3, 0.7)
+    assert dataclasses.replace(ours, lane_tversky=paper.lane_tversky) == paper

@@ -48,7 +48,7 @@ def test_sums_over_many_pixels_keep_their_digits(channels: int) -> None:
     generator = torch.Generator().manual_seed(0)
     x = (torch.rand((4, channels, 192, 320), generator=generator) + 4).to(memory_format=torch.channels_last)
     weight = torch.randn(x.shape, generator=generator).to(memory_format=torch.channels_last)
-    gradients = []
+    gradients: list[Tensor] = []
     for dtype in (torch.float32, torch.float64):
         bn, act = layers(channels, dtype)
         part = x.to(dtype).requires_grad_()

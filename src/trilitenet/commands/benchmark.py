@@ -20,8 +20,8 @@ import trilitenet
 from trilitenet.commands.load import load
 from trilitenet.config import VARIANTS
 from trilitenet.errors import ConfigError, OutputError, import_extra
-from trilitenet.inference.backend import usable_cores
 from trilitenet.inference.predictor import Predictor
+from trilitenet.processing.cores import usable_cores
 
 __all__ = ["Benchmark", "Cost", "Timing", "benchmark"]
 

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import io
 import json
-import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -35,6 +34,7 @@ from trilitenet.formats.readers.cvat import read_cvat
 from trilitenet.formats.readers.mapping import LabelMapping, read_mapping
 from trilitenet.formats.readers.masks import read_masks
 from trilitenet.formats.readers.yolo import read_yolo
+from trilitenet.processing.cores import usable_cores
 from trilitenet.processing.letterbox import Letterbox
 
 __all__ = ["Checked", "Converted", "Prepared", "Shown", "check", "convert", "prepare", "show"]
@@ -462,7 +462,7 @@ def _fitted(dataset: DrivingDataset, index: int, width: int) -> Any:
 
 
 def _workers(workers: int) -> int:
-    count = workers or os.cpu_count() or 1
+    count = workers or usable_cores()
     return 0 if count == 1 else count
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
-import os
 import platform
 import sys
 from collections.abc import Iterable, Mapping
@@ -15,6 +14,7 @@ import cv2
 import numpy as np
 
 import trilitenet
+from trilitenet.processing.cores import usable_cores
 
 __all__ = ["describe_hardware", "describe_versions", "hash_files", "peak_memory"]
 
@@ -56,8 +56,7 @@ def describe_hardware() -> str:
             if line.startswith("model name"):
                 model = line.partition(":")[2].strip()
                 break
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return f"{model}, {cores} cores, {platform.system()}"
+    return f"{model}, {usable_cores()} cores, {platform.system()}"
 
 
 def peak_memory() -> float:

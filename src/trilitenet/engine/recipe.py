@@ -134,7 +134,7 @@ class TrainConfig:
     single_class_loss: bool = True
     label_smoothing: float = 0.0
     drivable_tversky: tuple[float, float] = (0.7, 0.3)
-    lane_tversky: tuple[float, float] = (0.9, 0.1)
+    lane_tversky: tuple[float, float] = (0.3, 0.7)
     focal: tuple[float, float] = (0.25, 2.0)
     validate_every: int = 1
     checkpoint_every: int = 1

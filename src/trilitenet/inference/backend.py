@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Iterator
 from typing import Any, Final, Protocol, runtime_checkable
 
@@ -11,17 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import ModelCard
+from trilitenet.processing.cores import usable_cores
 from trilitenet.structures import RawOutputs
 
-__all__ = ["MOST_PARALLEL", "Backend", "ParallelSessions", "usable_cores"]
+__all__ = ["MOST_PARALLEL", "Backend", "ParallelSessions"]
 
 MOST_PARALLEL: Final = 4
 """At most so many images are computed at once where a backend trades latency for images a second."""
-
-
-def usable_cores() -> int:
-    """Return on how many processor cores this process may run."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class ParallelSessions:

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ModelCard
 from trilitenet.errors import BackendError, ConfigError, WeightsError, import_extra
-from trilitenet.inference.backend import MOST_PARALLEL, usable_cores
+from trilitenet.inference.backend import MOST_PARALLEL
 from trilitenet.inference.exported import prepare_input, read_metadata, run_images
+from trilitenet.processing.cores import usable_cores
 from trilitenet.structures import RawOutputs
 
 __all__ = ["OpenVINOBackend"]

@@ -7,13 +7,14 @@ for both, so that hard images are hard for both: a difference is real when its i
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
+
+from trilitenet.processing.cores import usable_cores
 
 __all__ = ["bootstrap", "draws", "interval"]
 
@@ -60,7 +61,7 @@ def bootstrap(
             done[number] = figures(weights)
 
     # NumPy lets other threads run while it computes; a thread holds one chunk of draws at a time.
-    workers = min(_THREADS, os.cpu_count() or 1)
+    workers = min(_THREADS, usable_cores())
     with ThreadPoolExecutor(workers, thread_name_prefix="bootstrap") as pool:
         for future in [pool.submit(work) for _ in range(workers)]:
             future.result()

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 
 from trilitenet.errors import ConfigError
+from trilitenet.processing.cores import usable_cores
 
 __all__ = ["Settings"]
 
@@ -72,4 +72,4 @@ class Settings:
     @property
     def thread_count(self) -> int:
         """Threads of each of the two pools."""
-        return self.threads or max(1, min(8, os.cpu_count() or 1))
+        return self.threads or max(1, min(8, usable_cores()))
