@@ -81,6 +81,20 @@ def test_dilated_gradient_under_bf16_autocast(channels: int, groups: int, dilati
     assert error < 0.02
 
 
+@pytest.mark.parametrize("training", [True, False])
+def test_the_stem_is_trained_in_fp32_under_autocast(training: bool) -> None:
+    encoder = Encoder(VARIANTS["tiny"]).train(training)
+    kinds: dict[str, torch.dtype] = {}
+    for name in ("level1", "b1", "level2_down", "b2"):
+        encoder.get_submodule(name).register_forward_hook(
+            lambda module, inputs, out, name=name: kinds.update({name: out.dtype})
+        )
+    with torch.autocast("cpu", torch.bfloat16):
+        encoder(torch.zeros(2, 3, 64, 64))
+    stem = torch.float32 if training else torch.bfloat16
+    assert kinds == {"level1": stem, "b1": stem, "level2_down": stem, "b2": torch.bfloat16}
+
+
 @pytest.mark.parametrize("variant", list(VARIANTS))
 def test_bf16_gradient_of_the_network_is_no_worse_in_channels_last(variant: str) -> None:
     """Beside fp32 both layouts differ by bf16's own rounding; what PyTorch gets wrong in one would stand out."""
