@@ -5,7 +5,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from trilitenet.models.activation import PReLU, batch_norm_prelu
+from trilitenet.models import activation
+from trilitenet.models.activation import AveragePool, PReLU, batch_norm_prelu
 
 
 def case(channels: int, dtype: torch.dtype, memory_format: torch.memory_format) -> tuple[Tensor, Tensor]:
@@ -29,7 +30,11 @@ def layers(channels: int, dtype: torch.dtype) -> tuple[nn.BatchNorm2d, PReLU]:
 
 @pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
 @pytest.mark.parametrize("channels", [2, 4, 8])
-def test_equals_the_plain_layers(channels: int, memory_format: torch.memory_format) -> None:
+@pytest.mark.parametrize("block", [1, 250, 2**18])  # a row, a few, all at a time
+def test_equals_the_plain_layers(
+    channels: int, block: int, memory_format: torch.memory_format, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(activation, "BLOCK", block)
     x, grad = case(channels, torch.float64, memory_format)
     bn, act = layers(channels, torch.float64)
     other, _ = layers(channels, torch.float64)
@@ -40,6 +45,24 @@ def test_equals_the_plain_layers(channels: int, memory_format: torch.memory_form
     ours = torch.autograd.grad(out, [x, bn.weight, bn.bias, act.weight], grad)
     theirs = torch.autograd.grad(expected, [x, other.weight, other.bias, act.weight], grad)
     torch.testing.assert_close(ours, theirs)
+
+
+@pytest.mark.parametrize("block", [1, 2**18])
+def test_prelu_alone_equals_the_plain_layer(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(activation, "BLOCK", block)
+    x, grad = case(6, torch.float64, torch.channels_last)
+    _, act = layers(6, torch.float64)
+    ours = torch.autograd.grad(act(x), [x, act.weight], grad)
+    theirs = torch.autograd.grad(F.prelu(x, act.weight), [x, act.weight], grad)
+    torch.testing.assert_close(ours, theirs)
+
+
+@pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
+def test_pool_equals_the_plain_layer(memory_format: torch.memory_format) -> None:
+    x, _ = case(3, torch.float32, memory_format)
+    pooled = AveragePool(3, stride=2, padding=1)(x)
+    torch.testing.assert_close(pooled, nn.AvgPool2d(3, stride=2, padding=1)(x))
+    assert pooled.is_contiguous(memory_format=memory_format)
 
 
 @pytest.mark.parametrize("channels", [4, 12])

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from trilitenet.config import VariantConfig
+from trilitenet.models.activation import AveragePool
 from trilitenet.models.blocks import ConvBNPReLU, DepthwiseESP, StrideESP
 
 __all__ = ["Encoder", "EncoderOutputs"]
@@ -44,7 +45,7 @@ class Encoder(nn.Module):
         super().__init__()
         c0, c1, c2, c3, c4 = variant.channels
         self.level1 = ConvBNPReLU(3, c0, stride=2)
-        self.pool = nn.AvgPool2d(3, stride=2, padding=1)  # zeros of the padding count in the mean
+        self.pool = AveragePool(3, stride=2, padding=1)  # zeros of the padding count in the mean
         self.b1 = ConvBNPReLU(c0 + 3, c1)
         self.level2_down = StrideESP(c1, c2)
         self.level2 = nn.ModuleList(DepthwiseESP(c2) for _ in range(variant.p))
