@@ -29,6 +29,7 @@ from trilitenet.engine.loggers import CsvLogger, read_csv
 from trilitenet.engine.predictions import PredictionWriter
 from trilitenet.engine.recipe import read_recipe
 from trilitenet.errors import ConfigError, OutputError, TrainingError, WeightsError
+from trilitenet.models.encoder import Encoder
 from trilitenet.models.trilitenet import TriLiteNet
 from trilitenet.models.weights import load_network, read_card
 from trilitenet.structures import Boxes, Perception
@@ -101,6 +102,22 @@ def test_resume_is_bit_for_bit(scenes: Path, tmp_path: Path) -> None:
     rows = [read_csv(tmp_path / name / "metrics.csv") for name in ("straight", "parts")]
     curves = [[row for row in part if row[1] != "images_per_second"] for part in rows]
     assert curves[0] == curves[1]
+
+
+def test_pixels_reach_the_network_unrounded_in_bf16(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen, plain = [], Encoder.forward
+
+    def forward(self: Encoder, image: torch.Tensor) -> Any:
+        seen.append(image)
+        return plain(self, image)
+
+    monkeypatch.setattr(Encoder, "forward", forward)
+    train(**settings(scenes, tmp_path, max_steps=1, precision="bf16-mixed"))
+    (image,) = seen
+    assert image.dtype is torch.float32
+    assert not torch.equal(image, image.bfloat16().float())
 
 
 def test_accumulation_sees_the_same_images(scenes: Path, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from typing import Any, Final, Protocol
 
 import torch
 import yaml
-from torch import Tensor
+from torch import Tensor, nn
 
 from trilitenet.config import ModelCard
 from trilitenet.data.batches import Batch
@@ -100,6 +100,18 @@ class TrainResult:
         return f"finished {speed}: {self.weights}" + (f" ({figures})" if figures else "")
 
 
+class _FromPixels(nn.Module):
+    """A network that takes (B, 3, H, W) uint8 RGB: Fabric would round normalised pixels to bf16 on their way in."""
+
+    def __init__(self, network: Any) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, images: Tensor) -> Any:
+        """Normalise the pixels and run the network."""
+        return self.network(normalise_images(images))
+
+
 class Trainer:
     """Trains one network; made anew for each run.
 
@@ -147,7 +159,7 @@ class Trainer:
             decay_all=config.decay_all,
         )
         compiled = torch.compile(self.network) if config.compile else self.network
-        self.model, self.optimiser = fabric.setup(compiled, optimiser)
+        self.model, self.optimiser = fabric.setup(_FromPixels(compiled), optimiser)
         self.loss = loss
         self.teacher = teacher and tuple(part.to(fabric.device).eval() for part in teacher)
         self.ema = MovingAverage(self.network, config.ema_decay, config.ema_ramp) if config.ema_decay else None
@@ -274,13 +286,13 @@ class Trainer:
         if self.config.multi_scale is not None:
             size = (batch.images.shape[2], batch.images.shape[3])
             batch = rescale(batch, draw_size(size, self.config.multi_scale, self.config.seed, self.step))
-        images = normalise_images(batch.images.contiguous(memory_format=torch.channels_last))
+        images = batch.images.contiguous(memory_format=torch.channels_last)
         outputs = self.model(images)
         terms: LossTerms = self.loss(outputs, batch)
         if self.teacher:
             network, distil = self.teacher
             with torch.no_grad(), self.fabric.autocast():
-                lesson = network(images)
+                lesson = network(normalise_images(images))
             terms = terms._replace(total=terms.total + torch.stack(tuple(distil(outputs, lesson))).sum())
         return terms
 
