@@ -90,6 +90,8 @@ def _plot(path: Path, curves: Mapping[str, tuple[list[int], list[float]]], *, lo
         axes.plot(steps, values, label=name, marker="o" if len(steps) < 30 else None, markersize=3)
     if log and all(value > 0 for _, values in curves.values() for value in values):
         axes.set_yscale("log")
+        highest = max(max(values) for _, values in curves.values())
+        axes.set_ylim(bottom=max(axes.get_ylim()[0], highest / 1e4))  # a term next to nothing flattens no other
     axes.set_xlabel("step")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
