@@ -15,7 +15,6 @@ import multiprocessing
 import statistics
 import time
 from collections.abc import Callable
-from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -56,18 +55,6 @@ class PlainMaskLoss(torch.nn.Module):
         return focal, (1 - hit / (hit + self.alpha * wrong + self.beta * missed)).mean() ** (4 / 3)
 
 
-@contextmanager
-def plain_layers(on: bool) -> Any:
-    """Let PReLU and batch normalisation run as PyTorch's own layers."""
-    kept = activation._by_rows
-    if on:
-        activation._by_rows = lambda x: False
-    try:
-        yield
-    finally:
-        activation._by_rows = kept
-
-
 def make(variant: str, batch: Batch, *, plain: bool, bf16: bool, device: str) -> Callable[[], None]:
     torch.manual_seed(0)
     layout = torch.contiguous_format if plain else torch.channels_last
@@ -81,16 +68,15 @@ def make(variant: str, batch: Batch, *, plain: bool, bf16: bool, device: str) ->
     ema = MovingAverage(network)
 
     def step() -> None:
-        with plain_layers(plain):
-            images = normalise_images(batch.images.contiguous(memory_format=layout))
-            with torch.autocast(device, dtype=torch.bfloat16, enabled=bf16):
-                outputs = network(images)
-            loss(outputs, batch).total.backward()
-            optimiser.step()
-            optimiser.zero_grad()
-            ema.update(network)
-            if device == "cuda":
-                torch.cuda.synchronize()
+        images = normalise_images(batch.images.contiguous(memory_format=layout))
+        with torch.autocast(device, dtype=torch.bfloat16, enabled=bf16):
+            outputs = network(images)
+        loss(outputs, batch).total.backward()
+        optimiser.step()
+        optimiser.zero_grad()
+        ema.update(network)
+        if device == "cuda":
+            torch.cuda.synchronize()
 
     return step
 
@@ -98,6 +84,8 @@ def make(variant: str, batch: Batch, *, plain: bool, bf16: bool, device: str) ->
 def serve(pipe: Any, variant: str, way: str, options: argparse.Namespace) -> None:
     """Make one way's steps in a process of its own, one whenever asked; answer seconds of wall and of processor."""
     plain, bf16 = WAYS[way]
+    if plain:  # PyTorch's own layers
+        activation._by_rows = lambda x: False
     if options.device == "cpu" and not (plain and options.allocator == "default"):
         keep_freed_memory()  # as `trilitenet train` does
     if options.threads:

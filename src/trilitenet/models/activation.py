@@ -55,8 +55,8 @@ class PReLU(nn.PReLU):
 
 def batch_norm_prelu(bn: nn.BatchNorm2d, act: nn.PReLU, x: Tensor) -> Tensor:
     """Return ``act(bn(x))``: (B, C, H, W) -> (B, C, H, W)."""
-    by_rows = x.dtype.itemsize >= 4 or x.shape[1] <= NARROW
-    if bn.training and by_rows and _by_rows(x) and bn.num_batches_tracked is not None:
+    worthwhile = x.dtype.itemsize >= 4 or x.shape[1] <= NARROW
+    if bn.training and worthwhile and _by_rows(x) and bn.num_batches_tracked is not None:
         bn.num_batches_tracked.add_(1)
         assert bn.momentum is not None
         apply: Any = _RowBatchNormPReLU.apply
