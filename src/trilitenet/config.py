@@ -9,8 +9,10 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
+import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from trilitenet.errors import ConfigError, WeightsError, did_you_mean
@@ -37,6 +39,7 @@ __all__ = [
     "check_tasks",
     "get_variant",
     "parse",
+    "read_yaml",
 ]
 
 Task = Literal["detection", "drivable", "lane"]
@@ -287,6 +290,25 @@ def parse(cls: type[_T], mapping: Mapping[str, Any], source: str) -> _T:
         return _adapter(cls).validate_python(dict(mapping))
     except ValidationError as error:
         raise ConfigError(f"{source}: {_explain(cls, error)}") from error
+
+
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """Read a YAML file of ``key: value`` lines; an empty one gives an empty mapping.
+
+    Raises:
+        ConfigError: If it cannot be read, is not YAML, or holds something else than a mapping.
+    """
+    try:
+        content: Any = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: not YAML ({' '.join(str(error).split())})") from error
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: must hold 'key: value' lines, got {type(content).__name__}")
+    return {str(key): value for key, value in content.items()}
 
 
 def _read_versioned(cls: type[_T], text: str, source: str, names: tuple[str, str], newest: int) -> _T:

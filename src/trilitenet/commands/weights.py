@@ -8,14 +8,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import yaml
-
 from trilitenet.commands.load import load
-from trilitenet.config import ModelCard, parse
+from trilitenet.config import ModelCard, parse, read_yaml
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.evaluate import best_thresholds
 from trilitenet.engine.evaluate import evaluate as run_evaluation
-from trilitenet.errors import ConfigError, OutputError
+from trilitenet.errors import OutputError
 from trilitenet.models.weights import import_published, load_network, read_card, resolve_weights, save_network
 
 __all__ = ["CardText", "finish", "import_weights", "info"]
@@ -120,13 +118,7 @@ def finish(
 
 
 def _read_card_text(path: Path) -> CardText:
-    try:
-        mapping = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path}: cannot be read as YAML ({' '.join(str(error).split())})") from error
-    if not isinstance(mapping, dict):
-        raise ConfigError(f"{path}: must hold 'key: value' lines")
-    return parse(CardText, mapping, str(path))
+    return parse(CardText, read_yaml(path), str(path))
 
 
 def _describe(card: ModelCard, texts: Sequence[CardText]) -> ModelCard:

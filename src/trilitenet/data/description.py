@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import yaml
 
-from trilitenet.config import TASKS, Task, parse
+from trilitenet.config import TASKS, Task, parse, read_yaml
 from trilitenet.errors import ConfigError, DataError
 
 __all__ = [
@@ -109,13 +109,7 @@ def read_description(root: Path) -> DatasetDescription:
     if not path.is_file():
         return DatasetDescription(name=root.name)
     try:
-        content: Any = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not YAML ({' '.join(str(error).split())})") from error
-    if not isinstance(content, dict):
-        raise DataError(f"{path}: must be a mapping of keys, got {type(content).__name__}")
-    try:
-        return parse(DatasetDescription, content, str(path))
+        return parse(DatasetDescription, read_yaml(path), str(path))
     except ConfigError as error:
         raise DataError(str(error)) from error
 

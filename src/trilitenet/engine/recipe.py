@@ -7,9 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
-import yaml
-
-from trilitenet.config import TASKS, Anchors, Task, get_variant, parse
+from trilitenet.config import TASKS, Anchors, Task, get_variant, parse, read_yaml
 from trilitenet.data.transforms import Augmentation
 from trilitenet.errors import ConfigError
 
@@ -224,14 +222,7 @@ def read_recipe(path: str | Path | None, overrides: Mapping[str, Any] | None = N
 def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     if path.resolve() in seen:
         raise ConfigError(f"{path}: is its own base, through {' -> '.join(str(p.name) for p in seen)}")
-    try:
-        mapping = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path}: cannot be read as YAML ({' '.join(str(error).split())})") from error
-    mapping = {} if mapping is None else mapping
-    if not isinstance(mapping, dict):
-        raise ConfigError(f"{path}: must hold 'key: value' lines")
-    mapping = {str(key): value for key, value in mapping.items()}
+    mapping = read_yaml(path)
     base = mapping.pop(BASE_KEY, None)
     if base is None:
         return mapping

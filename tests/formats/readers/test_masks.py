@@ -103,7 +103,7 @@ def test_values(value: str | int, parsed: int | tuple[int, int, int]) -> None:
         ("drivable_mask: {path: x, values: {1: direct, '1,2,3': direct}}", "all levels or all colours"),
         ("drivabel: [road]", "did you mean 'drivable'"),
         ("[1, 2", "not YAML"),
-        ("- 1", "mapping of keys"),
+        ("- 1", "must hold 'key: value' lines"),
     ],
 )
 def test_bad_mappings(tmp_path: Path, text: str, message: str) -> None:

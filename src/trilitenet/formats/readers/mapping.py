@@ -8,9 +8,7 @@ import re
 from pathlib import Path
 from typing import Any, Final, Literal
 
-import yaml
-
-from trilitenet.config import Task, check_tasks, parse
+from trilitenet.config import Task, check_tasks, parse, read_yaml
 from trilitenet.data.description import VEHICLES
 from trilitenet.data.records import AreaLabel, LaneLabel, RunLabel
 from trilitenet.errors import ConfigError, DataError
@@ -130,15 +128,7 @@ def read_mapping(path: str | Path | None) -> LabelMapping:
     """
     if path is None:
         return LabelMapping()
-    try:
-        content: Any = yaml.safe_load(Path(path).read_text(encoding="utf-8")) or {}
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not YAML ({' '.join(str(error).split())})") from error
-    if not isinstance(content, dict):
-        raise ConfigError(f"{path}: must be a mapping of keys")
-    mapping = parse(LabelMapping, content, str(path))
+    mapping = parse(LabelMapping, read_yaml(path), str(path))
     for rule in (mapping.drivable_mask, mapping.lane_mask):
         rule.meanings()
     return mapping
