@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from PIL import Image
 
 from tests.fakes import ColourBackend, coloured_scene
 from trilitenet.apps import cli
-from trilitenet.commands.predict import predict_with
+from trilitenet.commands.predict import RoadOptions, predict_with
 from trilitenet.errors import BackendError, ConfigError, InputError, OutputError
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, VideoReader
@@ -218,13 +219,15 @@ from tests.fakes import ColourBackend
 from trilitenet.commands.predict import predict_with
 from trilitenet.errors import OutputError
 from trilitenet.inference.predictor import Predictor
-resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
-for source in ("drive.mp4", "a.png"):
+tries = [("drive.mp4", ()), ("a.png", ())]
+tries += [("a.png", (name,)) for name in ("json", "coco", "scalabel", "openlabel", "cvat", "yolo", "parquet")]
+for source, formats in tries:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20 if formats else 50_000, 50_000))
     try:
         predict_with(Predictor(ColourBackend()), [Path({str(tmp_path)!r}) / source], Path({str(tmp_path)!r}) / "out",
-                     format=())
+                     format=formats, overlay=not formats)
     except OutputError as error:
-        assert "cannot be written (File too large)" in str(error), error
+        assert "cannot be written (" in str(error) and "File too large" in str(error), error
     else:
         sys.exit(f"{{source}}: nothing was raised")
 """
@@ -232,7 +235,7 @@ for source in ("drive.mp4", "a.png"):
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=120, cwd=Path(__file__).parents[2]
     )
     assert done.returncode == 0, done.stderr
-    assert list((tmp_path / "out").iterdir()) == []
+    assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == []
 
 
 def test_mistakes_are_named_before_anything_is_written(tmp_path: Path, predictor: Predictor, folder: Path) -> None:
@@ -253,6 +256,89 @@ def test_other_formats(format: str, folder: Path, tmp_path: Path, predictor: Pre
     report = predict_with(predictor, [folder / "photo.jpg"], tmp_path / "out", format=(format,), overlay=False)
     assert report.exit_code == 0
     assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
+
+
+def test_a_refused_command_leaves_nothing(tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "out"
+    for source, options, reason in (
+        ("photo.jpg", ["--model", "nope"], "nope: does not exist"),
+        ("photo.jpg", ["--confidence", "2"], "confidence must be"),
+        ("photo.jpg", ["--format", "nope"], "unknown format"),
+        ("absent.jpg", [], "no such file"),
+        ("photo.jpg", ["--end", "nan"], "end after it"),
+    ):
+        command = ["predict", str(folder / source), "--output", str(output), "--format", "coco", "--format", "csv"]
+        assert cli.main([*command, *options]) == 1
+        assert reason in capsys.readouterr().err
+        assert not output.exists()
+
+
+def test_names_that_two_formats_want_are_refused(tmp_path: Path, predictor: Predictor) -> None:
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    for name in ("coco", "drive-0000003"):
+        Image.fromarray(coloured_scene()).save(pictures / f"{name}.jpg")
+    video = drive(tmp_path / "drive.mp4")
+    with pytest.raises(OutputError, match=r"coco\.json would be written twice"):
+        predict_with(predictor, [pictures], tmp_path / "out", format=("json", "coco"))
+    with pytest.raises(OutputError, match=r"drive-0000003\.txt would be written twice"):
+        predict_with(predictor, [video, pictures], tmp_path / "out", format=("yolo",), overwrite=True)
+    assert not (tmp_path / "out").exists()
+    assert predict_with(predictor, [pictures], tmp_path / "out", format=("jsonl", "coco")).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("format", "there"),
+    [
+        ("openlabel", "photo.openlabel.json"),
+        ("openlabel", "drive.openlabel.json"),
+        ("cvat", "drive.cvat-video.xml"),
+        ("cvat", "cvat-images.xml"),
+        ("yolo", "labels/drive-0000007.txt"),
+        ("yolo", "data.yaml"),
+        ("csv", "boxes.csv"),
+    ],
+)
+def test_results_of_every_format_are_refused_before_the_work(
+    format: str, there: str, folder: Path, tmp_path: Path, predictor: Predictor
+) -> None:
+    output = tmp_path / "out"
+    (output / there).parent.mkdir(parents=True)
+    (output / there).write_text("mine")
+    sources = [folder / "alpha.png", folder / "photo.jpg", drive(tmp_path / "drive.mp4")]
+    with pytest.raises(OutputError, match=f"{Path(there).name}: exists already"):
+        predict_with(predictor, sources, output, format=(format,), overlay=False)
+    assert [path for path in output.rglob("*") if path.is_file()] == [output / there]
+    assert (output / there).read_text() == "mine"
+
+
+def test_a_picture_of_another_shape_than_the_camera_does_not_stop_the_others(
+    tmp_path: Path, predictor: Predictor
+) -> None:
+    square = tmp_path / "square.png"
+    Image.fromarray(coloured_scene(240, 240)).save(square)
+    (tmp_path / "camera.yaml").write_text("image_width: 320\nimage_height: 180\nfield_of_view: 60\nheight: 1.4\n")
+    other = tmp_path / "other.png"
+    Image.fromarray(coloured_scene(180, 320)).save(other)
+    road = RoadOptions(measure=True, camera=tmp_path / "camera.yaml")
+    video = drive(tmp_path / "drive.mp4")
+    report = predict_with(predictor, [square, other, video], tmp_path / "out", road=road)
+    assert (report.images, report.videos) == (1, 1)
+    assert [Path(failure.source).name for failure in report.failures] == ["square.png"]
+    assert "another shape" in report.failures[0].reason
+    assert report.failures[0].reason.startswith(str(square))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="file names are bytes on Linux alone")
+def test_names_that_no_file_can_have_are_failures_of_their_own(
+    tmp_path: Path, predictor: Predictor, folder: Path
+) -> None:
+    odd = tmp_path / os.fsdecode(b"\xe4.png")
+    Image.fromarray(coloured_scene()).save(odd)
+    report = predict_with(predictor, [odd, "a" * 300, folder / "photo.jpg"], tmp_path / "out", format=("json", "coco"))
+    assert report.images == 1
+    assert ["not UTF-8" in report.failures[0].reason, "too long" in report.failures[1].reason] == [True, True]
+    assert "\\xe4.png" in report.failures[0].reason
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are sent in another way")

@@ -8,7 +8,7 @@ from PIL import Image
 
 from tests.fakes import ColourBackend, coloured_scene
 from trilitenet.config import Thresholds
-from trilitenet.errors import ConfigError, InputError
+from trilitenet.errors import ConfigError, InputError, ShapeError
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.predictor import Predictor
 
@@ -69,6 +69,13 @@ def test_a_list_is_batched_by_canvas_size_and_stays_in_order() -> None:
     for perception, size in zip(perceptions, sizes, strict=True):
         check(perception, *size)
     assert Predictor(backend)([]) == []
+
+
+def test_images_may_come_from_a_generator() -> None:
+    predictor = Predictor(ColourBackend(), batch_size=2)
+    assert len(predictor(coloured_scene() for _ in range(3))) == 3  # type: ignore[call-overload]
+    with pytest.raises(ShapeError, match="got NoneType"):
+        predictor(None)  # type: ignore[call-overload]
 
 
 def test_stages_make_the_whole() -> None:

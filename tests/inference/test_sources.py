@@ -305,7 +305,7 @@ def test_numbered_pictures_are_a_video(tmp_path: Path) -> None:
     assert reader.name == str(tmp_path / "img")
     with pytest.raises(InputError, match="no file matches"):
         SequenceReader(str(tmp_path / "other_%04d.png"))
-    with pytest.raises(ConfigError, match="must be positive"):
+    with pytest.raises(ConfigError, match="must be above 0"):
         SequenceReader(str(tmp_path / "img_%04d.png"), rate=0)
 
 

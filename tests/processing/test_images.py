@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -92,3 +93,20 @@ def test_arrays() -> None:
             read_image(wrong)
     with pytest.raises(ShapeError, match="uint8"):
         read_image(np.zeros((4, 4, 3), np.float32))
+
+
+@pytest.mark.parametrize("values", [[0.0, 0.5, 1.0], [0.0, np.nan, 200.0], [0.0, np.inf, 1.0]])
+def test_fractions_are_refused_not_taken_for_black(values: list[float]) -> None:
+    with pytest.raises(InputError, match=r"scale it to 0 \.\. 255"):
+        read_image(encoded(Image.fromarray(np.array([values], np.float32)), "TIFF"))
+
+
+@pytest.mark.parametrize("image", [None, 3, bytearray(b"x"), object()])
+def test_what_is_no_image_is_refused(image: Any) -> None:
+    with pytest.raises(ShapeError, match="an image is a path, bytes, a PIL image or an array"):
+        read_image(image)
+
+
+def test_a_path_that_cannot_be_is_no_file() -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_image("a\0b")

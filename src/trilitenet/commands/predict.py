@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import logging
 import os
+import re
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -21,8 +22,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.text import Text
 
 from trilitenet.commands.load import load
-from trilitenet.errors import BackendError, InputError, OutputError, TriLiteNetError
-from trilitenet.formats.writers.base import Writer, open_writer
+from trilitenet.errors import BackendError, InputError, OutputError, ShapeError, TriLiteNetError
+from trilitenet.formats.writers.base import Writer, find_writer, open_writer
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, Failure, FrameReader, Stills, find_sources
 from trilitenet.inference.video import PerceptionStream, VideoWriter
@@ -255,32 +256,68 @@ class _Job:
         self.overlay = overlay
         self.clip = clip
         self.sources, self.failures = find_sources(sources, clip, rate=rate)
-        names = [name for source in self.sources for name in _names(source)]
-        self.stems = _allot_stems(names)
-        self._check_output(names, overwrite=overwrite)
+        self.formats = tuple(dict.fromkeys(formats))
+        self.overwrite = overwrite
+        self.names = [name for source in self.sources for name in _names(source)]
+        self.stems = _allot_stems(self.names)
+        self._check_output()
+        self._check_formats()
         self.writers: list[Writer] = []
-        with _writing(output):
-            output.mkdir(parents=True, exist_ok=True)
-            for name in dict.fromkeys(formats):
-                self.writers.append(open_writer(name, output, overwrite=overwrite))
-        for writer in self.writers:  # the same names as the overlays, whichever source fails
-            for name in names:
-                writer.stem(Perception(size=(1, 1), source=name))
         self.images = self.videos = self.frames = 0
         self.files: list[Path] = []
 
-    def _check_output(self, names: Sequence[str], *, overwrite: bool) -> None:
+    def _check_output(self) -> None:
         if self.output.exists() and not self.output.is_dir():
             raise OutputError(f"{self.output}: is a file; give a folder for --output")
-        originals = {Path(name).resolve() for name in names if Path(name).exists()}
+        originals = {Path(name).resolve() for name in self.names if Path(name).exists()}
         stems = set(self.stems.values())
         for folder in (self.output, self.output / "labels"):
             for path in sorted(folder.iterdir()) if folder.is_dir() else ():
                 if path.stem in stems and path.is_file():
                     if path.resolve() in originals:
                         raise OutputError(f"{path}: results would lie beside their source; choose another --output")
-                    if not overwrite:
+                    if not self.overwrite:
                         raise OutputError(f"{path}: exists already; choose another --output or add --overwrite")
+
+    def _check_formats(self) -> None:
+        """Refuse formats that do not exist, and files that exist or would be written twice."""
+        planned: dict[str, str] = {}
+        numbered: list[tuple[str, re.Pattern[str], str]] = []
+
+        def plan(file: str, what: str) -> None:
+            if file in planned:
+                raise OutputError(
+                    f"{self.output / file} would be written twice, {planned[file]} and {what}; "
+                    "rename a source, or give the formats an --output each"
+                )
+            planned[file] = what
+            if not self.overwrite and (self.output / file).exists():
+                raise OutputError(f"{self.output / file}: exists already; choose another --output or add --overwrite")
+
+        for name in self.formats:
+            writer = find_writer(name)
+            for file in writer.FILES:
+                plan(file, f"as all of {name}")
+            if any(isinstance(source, Stills) for source in self.sources):
+                for file in writer.PICTURE_FILES:
+                    if "{}" not in file:
+                        plan(file, f"as the pictures of {name}")
+            for source in self.sources:
+                for pattern in writer.PICTURE_FILES if isinstance(source, Stills) else writer.VIDEO_FILES:
+                    for each in _names(source) if "{}" in pattern else ():
+                        file, what = pattern.format(self.stems[each]), f"as {name} of {each}"
+                        if "*" in pattern:
+                            number = re.escape(pattern).replace(r"\*", r"\d+")
+                            number = number.replace(r"\{\}", re.escape(self.stems[each]))
+                            numbered.append((file, re.compile(number), what))
+                        else:
+                            plan(file, what)
+        for file, frames, what in numbered:
+            place = self.output / PurePath(file).parent
+            there = () if self.overwrite or not place.is_dir() else place.iterdir()
+            for other in [*planned, *(path.relative_to(self.output).as_posix() for path in there)]:
+                if frames.fullmatch(other):
+                    plan(other, what)
 
     def run(
         self,
@@ -297,9 +334,14 @@ class _Job:
         began = time.perf_counter()
         interrupted = False
         with contextlib.ExitStack() as stack:
-            for writer in self.writers:
-                stack.enter_context(writer)
             stack.enter_context(_writing(self.output))
+            if self.sources:
+                self.output.mkdir(parents=True, exist_ok=True)
+                for name in self.formats:
+                    writer = stack.enter_context(open_writer(name, self.output, overwrite=self.overwrite))
+                    self.writers.append(writer)
+                    for source_name in self.names:  # the same names as the overlays, whichever source fails
+                        writer.stem(Perception(size=(1, 1), source=source_name))
             progress = stack.enter_context(_show_progress(quiet))
             if window is not None:
                 stack.enter_context(contextlib.closing(window))
@@ -347,8 +389,14 @@ class _Job:
                     if isinstance(item, Failure):
                         self.failures.append(item)
                     else:
-                        perception, road = _follow(item, follow or self.road.open(still=True))
-                        self._take(perception, road, video, hide, window)
+                        try:
+                            perception, road = _follow(item, follow or self.road.open(still=True))
+                        except ShapeError as error:  # of another shape than the camera's pictures
+                            if isinstance(source, FrameReader):
+                                raise InputError(f"{source.name}: {error}") from error
+                            self.failures.append(Failure(str(item.source), f"{item.source}: {error}"))
+                        else:
+                            self._take(perception, road, video, hide, window)
                     progress.advance(task)
             except InputError as error:
                 assert isinstance(source, FrameReader)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeAlias, overload
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trilitenet.config import ModelCard, Thresholds
-from trilitenet.errors import ConfigError
+from trilitenet.errors import ConfigError, ShapeError
 from trilitenet.inference.backend import Backend
 from trilitenet.processing.images import read_image
 from trilitenet.processing.letterbox import Letterbox
@@ -91,7 +91,10 @@ class Predictor:
         """
         if isinstance(image, (str, Path, bytes, Image.Image, np.ndarray)):
             return self.perceive([read_image(image)], [_name(image)])[0]
-        return self.perceive([read_image(one) for one in image], [_name(one) for one in image])
+        if not isinstance(image, Iterable):
+            raise ShapeError(f"an image is a path, bytes, a PIL image or an array, got {type(image).__name__}")
+        images = list(image)
+        return self.perceive([read_image(one) for one in images], [_name(one) for one in images])
 
     def perceive(
         self, images: Sequence[NDArray[np.uint8]], sources: Sequence[str | None] | None = None

@@ -12,6 +12,8 @@ import dataclasses
 import functools
 import glob
 import logging
+import math
+import os
 import re
 import sys
 import threading
@@ -108,7 +110,8 @@ class Clip:
     def __post_init__(self) -> None:
         if self.every < 1 or (self.max_frames is not None and self.max_frames < 1):
             raise ConfigError(f"every and max_frames must be at least 1, got {self.every} and {self.max_frames}")
-        if self.start < 0 or (self.end is not None and self.end <= self.start):
+        end = self.start + 1 if self.end is None else self.end
+        if not (0 <= self.start < end and math.isfinite(end)):
             raise ConfigError(f"start must be at least 0 and end after it, got {self.start} and {self.end}")
 
     def expected(self, frames: int | None, rate: float | None) -> int | None:
@@ -338,8 +341,8 @@ class SequenceReader(FrameReader):
             raise ConfigError(f"{pattern}: a pattern of numbered pictures has one %d, such as frames/%06d.jpg")
         before, after = pattern[: place.start()], pattern[place.end() :]
         digits = int(place.group(1) or 1)
-        if rate <= 0:
-            raise ConfigError(f"the frame rate must be positive, got {rate}")
+        if not 0 < rate <= 1000:
+            raise ConfigError(f"the frame rate must be above 0 and at most 1000, got {rate}")
         super().__init__(before.rstrip("/\\_-. ") or "sequence", clip)
         self.rate = rate
         exact = re.compile(rf"{re.escape(before)}(\d{{{digits},}}){re.escape(after)}\Z")
@@ -429,7 +432,13 @@ def find_sources(
             except InputError as error:
                 failures.append(Failure(name, str(error)))
                 continue
+            except OSError as error:  # a name too long, a folder that may not be listed
+                failures.append(Failure(name, f"{name}: cannot be read ({error.strerror})"))
+                continue
             for path in paths:
+                if (shown := _printable(str(path))) != str(path):
+                    failures.append(Failure(shown, f"{shown}: its name is not UTF-8; rename it"))
+                    continue
                 if path.absolute() in taken:
                     continue
                 taken.add(path.absolute())
@@ -440,6 +449,11 @@ def find_sources(
     if stills:
         sources.append(Stills(tuple(stills)))
     return sources, failures
+
+
+def _printable(name: str) -> str:
+    """Return a file name with what is not UTF-8 in it as escapes."""
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 def _open_url(url: str, clip: Clip | None) -> FrameReader:

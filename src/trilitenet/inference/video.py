@@ -263,11 +263,11 @@ class VideoWriter:
                 self._mux(None)
                 self._container.close()
                 self._partial.replace(self.path)
-        except (self._av.FFmpegError, OSError, ValueError) as error:
+        except Exception as error:  # whatever it is, the caller must hear of it and not wait
             reason = getattr(error, "strerror", None) or str(error)
             self._error = OutputError(f"{self.path}: the video cannot be written ({reason})")
             if self._container is not None:
-                with contextlib.suppress(self._av.FFmpegError, OSError, ValueError):
+                with contextlib.suppress(Exception):
                     self._container.close()
             with contextlib.suppress(OSError):
                 self._partial.unlink(missing_ok=True)

@@ -45,14 +45,16 @@ def read_image(image: str | Path | bytes | Image.Image | NDArray[Any]) -> NDArra
         return _decode(image, "the image")
     if isinstance(image, bytes):
         name, data = "the image", image
-    else:
+    elif isinstance(image, (str, Path)):
         name = str(image)
         try:
             data = Path(image).read_bytes()
-        except FileNotFoundError as error:
+        except (FileNotFoundError, ValueError) as error:  # ValueError: a zero byte in it
             raise InputError(f"{name}: no such file") from error
         except OSError as error:
             raise InputError(f"{name}: cannot be read ({error.strerror or error})") from error
+    else:
+        raise ShapeError(f"an image is a path, bytes, a PIL image or an array, got {type(image).__name__}")
     if not data:
         raise InputError(f"{name}: is empty")
     try:
@@ -95,15 +97,17 @@ def _decode(image: Image.Image, name: str) -> NDArray[np.uint8]:
         if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:  # asked first, because both calls always copy
             image = ImageOps.exif_transpose(image)
         if image.mode in {"I", "F"} or image.mode.startswith("I;16"):
-            return _scale_deep(np.asarray(image))
+            return _scale_deep(np.asarray(image), name)
         return np.array(image if image.mode == "RGB" else image.convert("RGB"), np.uint8)
     except _BROKEN as error:
         raise InputError(f"{name}: is broken or truncated ({_reason(error)})") from error
 
 
-def _scale_deep(grey: NDArray[Any]) -> NDArray[np.uint8]:
+def _scale_deep(grey: NDArray[Any], name: str) -> NDArray[np.uint8]:
     """Scale (height, width) grey of 16 or 32 bit to 8 bit: from 0 .. 65535 if it exceeds 255 anywhere."""
     values = grey.astype(np.float32)
+    if not np.isfinite(values).all() or (grey.dtype.kind == "f" and values.size and values.max() <= 1.0):
+        raise InputError(f"{name}: holds fractions or no numbers; scale it to 0 .. 255 or 0 .. 65535")
     if values.size and values.max() > 255:
         values /= 257.0
     return to_rgb(np.clip(np.rint(values), 0, 255).astype(np.uint8))

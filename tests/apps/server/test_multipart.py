@@ -36,6 +36,7 @@ def test_preamble_and_quoted_boundary() -> None:
         (b"--xyz\r\n" + b"a" * 9000 + b"\r\n\r\n1\r\n--xyz--", TYPE),
         (_part("image", b"1") + b"--xyz--", "multipart/form-data"),
         (_part("image", b"1") + b"--xyz--", "multipart/form-data; boundary="),
+        (_part("image", b"1") + b"--xyz--", "multipart/form-data; boundary*" + "1" * 5000 + "=xyz"),
         (_part("image", b"1") + b"--xyz--", "multipart/form-data; boundary=" + "x" * 300),
     ],
 )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from trilitenet.errors import ConfigError, OutputError
-from trilitenet.formats.writers.base import WRITERS, JsonStream, open_writer
+from trilitenet.formats.writers.base import WRITERS, JsonStream, open_writer, part_of
 from trilitenet.structures import Boxes, Perception
 
 TASKS_GONE = Perception(size=(120, 200), class_names=("vehicle",), source="tasks.jpg")
@@ -64,7 +64,7 @@ def test_a_file_gets_its_name_when_it_is_whole(tmp_path: Path) -> None:
     stream.add({"a": 1})
     assert not (tmp_path / "a.json").exists()
     stream.close("]")
-    assert json.loads(stream.partial.read_text()) == [{"a": 1}]
+    assert json.loads(part_of(tmp_path / "a.json").read_text()) == [{"a": 1}]
 
 
 def test_output_that_is_a_file_is_an_error(tmp_path: Path, pictures: list[Perception]) -> None:

@@ -179,7 +179,10 @@ def _wanted(mapping: dict[str, Any], names: Sequence[str]) -> dict[str, bool]:
         name = output.get("name")
         if name not in names:
             raise _bad(f"unknown output {str(name)[:40]!r}; there are {', '.join(names)}")
-        if "classification" in (output.get("parameters") or {}):
+        parameters = output.get("parameters") or {}
+        if not isinstance(parameters, dict):
+            raise _bad("the parameters of an output must be an object")
+        if "classification" in parameters:
             raise _bad("the classification extension is not supported")
         wanted[name] = _flag(output, "binary_data", binary)
     return wanted

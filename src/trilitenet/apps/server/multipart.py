@@ -74,5 +74,8 @@ def _field_name(headers: bytes) -> str:
 def _parameter(header: str, value: str, name: str) -> str:
     message = Message()
     message[header] = value.replace("\r", " ").replace("\n", " ").strip()
-    found = message.get_param(name, "", header=header)
+    try:
+        found = message.get_param(name, "", header=header)
+    except ValueError:  # a part's number of thousands of digits
+        return ""
     return found if isinstance(found, str) else ""

@@ -18,7 +18,7 @@ import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePath
 from types import TracebackType
-from typing import IO, TYPE_CHECKING, Any, Final
+from typing import IO, TYPE_CHECKING, Any, ClassVar, Final
 
 from trilitenet.errors import ConfigError, OutputError, did_you_mean
 from trilitenet.structures import Perception
@@ -26,7 +26,7 @@ from trilitenet.structures import Perception
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["WRITERS", "JsonStream", "Writer", "open_writer"]
+__all__ = ["WRITERS", "JsonStream", "Writer", "find_writer", "open_writer", "part_of"]
 
 WRITERS: Final[dict[str, str]] = {
     "json": "trilitenet.formats.writers.native:JsonWriter",
@@ -55,10 +55,18 @@ class Writer(abc.ABC):
         files: The files that are whole so far.
     """
 
+    FILES: ClassVar[tuple[str, ...]] = ()
+    """Names of the files that it writes whatever it is given."""
+    PICTURE_FILES: ClassVar[tuple[str, ...]] = ()
+    """Names of the files that it writes for a picture; ``{}`` is the source's `stem`."""
+    VIDEO_FILES: ClassVar[tuple[str, ...]] = ()
+    """Names of the files that it writes for a video; ``*`` stands for a number a frame."""
+
     def __init__(self, output: Path, *, overwrite: bool = False) -> None:
         self.output = output
         self.overwrite = overwrite
         self.files: list[Path] = []
+        self._begun: list[Path] = []
         self._stems: dict[str, str] = {}
         self._taken: set[str] = set()
         self._names: dict[str, str] = {}
@@ -87,7 +95,13 @@ class Writer(abc.ABC):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        """Finish what there is; where that fails, leave no half file."""
+        try:
+            self.close()
+        except OSError:
+            for path in set(self._begun) - set(self.files):
+                part_of(path).unlink(missing_ok=True)
+            raise
 
     def create(self, name: str) -> Path:
         """Return the path of a file to write, in a folder that exists.
@@ -102,12 +116,24 @@ class Writer(abc.ABC):
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"{path.parent}: cannot be made ({error.strerror})") from error
+        self._begun.append(path)
         return path
 
-    def finish(self, partial: Path, path: Path) -> None:
-        """Give a whole file its final name."""
-        partial.replace(path)
+    def finish(self, path: Path) -> None:
+        """Give a file that is whole its final name."""
+        part_of(path).replace(path)
+        self._begun.remove(path)
         self.files.append(path)
+
+    def write_whole(self, path: Path, text: str) -> None:
+        """Write a small file at once, so that it is whole or not there."""
+        partial = part_of(path)
+        try:
+            partial.write_text(text, encoding="utf-8")
+            self.finish(path)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
 
     def stem(self, perception: Perception) -> str:
         """Return a file name without ending for the perception's source: the same for all frames of a video.
@@ -158,11 +184,25 @@ def open_writer(format: str, output: Path, *, overwrite: bool = False, **options
         ConfigError: If the format is unknown.
         MissingExtraError: If the format needs a package that is not installed.
     """
+    return find_writer(format)(output, overwrite=overwrite, **options)
+
+
+def find_writer(format: str) -> type[Writer]:
+    """Return the class of a format's writer.
+
+    Raises:
+        ConfigError: If the format is unknown.
+    """
     if format not in WRITERS:
         raise ConfigError(f"unknown format {format!r}{did_you_mean(format, WRITERS)}")
     module, _, name = WRITERS[format].partition(":")
-    writer: Writer = getattr(importlib.import_module(module), name)(output, overwrite=overwrite, **options)
+    writer: type[Writer] = getattr(importlib.import_module(module), name)
     return writer
+
+
+def part_of(path: Path) -> Path:
+    """Return where a file is written until it is whole."""
+    return path.with_name(f"{path.name}.part")
 
 
 class JsonStream:
@@ -175,8 +215,7 @@ class JsonStream:
 
     def __init__(self, path: Path, head: str) -> None:
         self.path = path
-        self.partial = path.with_name(f"{path.name}.part")
-        self._handle: IO[str] = self.partial.open("w", encoding="utf-8")
+        self._handle: IO[str] = part_of(path).open("w", encoding="utf-8")
         self._handle.write(head)
         self._first = True
 

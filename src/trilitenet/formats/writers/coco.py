@@ -27,6 +27,8 @@ class CocoWriter(Writer):
         overwrite: Replace files that exist.
     """
 
+    FILES = ("coco.json",)
+
     def __init__(self, output: Path, *, overwrite: bool = False) -> None:
         super().__init__(output, overwrite=overwrite)
         head = f'{{"info": {dumps({"description": "Written by trilitenet", "version": "1.0"})},\n"annotations": ['
@@ -84,7 +86,7 @@ class CocoWriter(Writer):
         numbered = [{"id": number, **category} for number, category in enumerate(categories, start=1)]
         images = ",\n".join(dumps(image) for image in self._images)
         self._stream.close(f'],\n"images": [\n{images}\n],\n"categories": {dumps(numbered)}}}')
-        self.finish(self._stream.partial, self._stream.path)
+        self.finish(self._stream.path)
         self._stream = None
 
     def _add(self, image_id: int, annotation: dict[str, Any]) -> None:

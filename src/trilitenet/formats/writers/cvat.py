@@ -16,7 +16,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.formats.writers.base import Writer, polylines
+from trilitenet.formats.writers.base import Writer, part_of, polylines
 from trilitenet.processing.polygons import mask_to_polygons
 from trilitenet.structures import Perception
 
@@ -37,6 +37,9 @@ class CvatWriter(Writer):
         overwrite: Replace files that exist.
         tolerance: A polygon leaves the mask's outline by at most so many pixels.
     """
+
+    PICTURE_FILES = ("cvat-images.xml",)
+    VIDEO_FILES = ("{}.cvat-video.xml",)
 
     def __init__(self, output: Path, *, overwrite: bool = False, tolerance: float = 1.0) -> None:
         super().__init__(output, overwrite=overwrite)
@@ -62,15 +65,14 @@ class CvatWriter(Writer):
         self._close_video()
         if self._images is not None:
             self._images.close()
-            self.finish(self._images.partial, self._images.path)
+            self.finish(self._images.path)
             self._images = None
 
     def _close_video(self) -> None:
         if self._video is not None:
-            partial = _partial(self._video.path)
-            with partial.open("w", encoding="utf-8") as handle:
+            with part_of(self._video.path).open("w", encoding="utf-8") as handle:
                 self._video.dump(handle)
-            self.finish(partial, self._video.path)
+            self.finish(self._video.path)
             self._video = None
 
 
@@ -94,10 +96,6 @@ def cvat_mask(mask: NDArray[np.bool_]) -> tuple[str, int, int, int, int] | None:
     runs = np.diff(np.concatenate([[0], edges, [len(flat)]]))
     text = ", ".join(str(run) for run in ([0, *runs] if flat[0] else runs))
     return text, left, top, inside.shape[1], inside.shape[0]
-
-
-def _partial(path: Path) -> Path:
-    return path.with_name(f"{path.name}.part")
 
 
 def _labels(perception: Perception) -> str:
@@ -132,9 +130,8 @@ class _ImagesFile:
 
     def __init__(self, path: Path, first: Perception) -> None:
         self.path = path
-        self.partial = _partial(path)
         self.count = 0
-        self._handle: IO[str] = self.partial.open("w", encoding="utf-8")
+        self._handle: IO[str] = part_of(path).open("w", encoding="utf-8")
         self._handle.write(f"{_HEAD}  <meta>\n    <task>\n{_labels(first)}    </task>\n  </meta>\n")
 
     def add(self, perception: Perception, name: str, road: Mapping[str, Any] | None) -> None:

@@ -39,6 +39,8 @@ class JsonWriter(Writer):
         overwrite: Replace files that exist.
     """
 
+    PICTURE_FILES = VIDEO_FILES = ("{}.json",)
+
     def __init__(self, output: Path, *, overwrite: bool = False) -> None:
         super().__init__(output, overwrite=overwrite)
         self._video: JsonStream | None = None
@@ -50,8 +52,7 @@ class JsonWriter(Writer):
         if perception.frame is None:
             self.close()
             path = self.create(f"{self.stem(perception)}.json")
-            path.write_text(f"{dumps(document)}\n", encoding="utf-8")
-            self.files.append(path)
+            self.write_whole(path, f"{dumps(document)}\n")
             return
         if self._video is None or self._source != perception.source:
             self.close()
@@ -64,7 +65,7 @@ class JsonWriter(Writer):
         """Finish the file of the last video."""
         if self._video is not None:
             self._video.close("]}")
-            self.finish(self._video.partial, self._video.path)
+            self.finish(self._video.path)
             self._video = None
 
 
@@ -75,6 +76,8 @@ class JsonLinesWriter(Writer):
         output: The folder.
         overwrite: Replace files that exist.
     """
+
+    FILES = ("perceptions.jsonl",)
 
     def __init__(self, output: Path, *, overwrite: bool = False) -> None:
         super().__init__(output, overwrite=overwrite)

@@ -36,6 +36,8 @@ class OpenLabelWriter(Writer):
         overwrite: Replace files that exist.
     """
 
+    PICTURE_FILES = VIDEO_FILES = ("{}.openlabel.json",)
+
     def __init__(self, output: Path, *, overwrite: bool = False) -> None:
         super().__init__(output, overwrite=overwrite)
         self._document: _Document | None = None
@@ -53,7 +55,7 @@ class OpenLabelWriter(Writer):
         """Finish the file of the last picture or video."""
         if self._document is not None:
             self._document.close()
-            self.finish(self._document.stream.partial, self._document.stream.path)
+            self.finish(self._document.stream.path)
             self._document = None
 
 

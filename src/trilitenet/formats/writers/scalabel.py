@@ -24,6 +24,8 @@ class ScalabelWriter(Writer):
         overwrite: Replace files that exist.
     """
 
+    FILES = ("scalabel.json",)
+
     def __init__(self, output: Path, *, overwrite: bool = False) -> None:
         super().__init__(output, overwrite=overwrite)
         self._stream: JsonStream | None = JsonStream(self.create("scalabel.json"), '{"frames": [')
@@ -58,7 +60,7 @@ class ScalabelWriter(Writer):
             {"name": "lane line", "isThing": True},
         ]
         self._stream.close(f'],\n"groups": null,\n"config": {dumps({"categories": categories})}}}')
-        self.finish(self._stream.partial, self._stream.path)
+        self.finish(self._stream.path)
         self._stream = None
 
     def _boxes(self, perception: Perception) -> list[dict[str, Any]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from trilitenet.errors import import_extra
-from trilitenet.formats.writers.base import Writer, rounded
+from trilitenet.formats.writers.base import Writer, part_of, rounded
 from trilitenet.processing.serialise import encode_mask
 from trilitenet.structures import SCHEMA_VERSION, Perception
 
@@ -106,6 +106,8 @@ class CsvWriter(Writer):
         overwrite: Replace files that exist.
     """
 
+    FILES = ("frames.csv", "boxes.csv")
+
     def __init__(self, output: Path, *, overwrite: bool = False) -> None:
         super().__init__(output, overwrite=overwrite)
         paths = [self.create("frames.csv"), self.create("boxes.csv")]
@@ -140,6 +142,8 @@ class ParquetWriter(Writer):
         MissingExtraError: If pyarrow is not installed.
     """
 
+    FILES = ("perceptions.parquet",)
+
     def __init__(self, output: Path, *, overwrite: bool = False) -> None:
         self._arrow = import_extra("pyarrow", "parquet")
         parquet = import_extra("pyarrow.parquet", "parquet")
@@ -159,8 +163,7 @@ class ParquetWriter(Writer):
             metadata={"trilitenet.schema": SCHEMA_VERSION},
         )
         self._path = self.create("perceptions.parquet")
-        self._partial = self._path.with_name(f"{self._path.name}.part")
-        self._file = parquet.ParquetWriter(self._partial, self._schema, compression="zstd")
+        self._file = parquet.ParquetWriter(part_of(self._path), self._schema, compression="zstd")
         self._rows: list[dict[str, Any]] = []
         self._open = True
 
@@ -185,7 +188,7 @@ class ParquetWriter(Writer):
         self._open = False
         self._flush()
         self._file.close()
-        self.finish(self._partial, self._path)
+        self.finish(self._path)
 
     def _flush(self) -> None:
         if self._rows:

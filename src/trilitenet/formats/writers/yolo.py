@@ -29,6 +29,10 @@ class YoloWriter(Writer):
             take five.
     """
 
+    FILES = ("data.yaml",)
+    PICTURE_FILES = ("labels/{}.txt",)
+    VIDEO_FILES = ("labels/{}-*.txt",)
+
     def __init__(self, output: Path, *, overwrite: bool = False, confidence: bool = False) -> None:
         super().__init__(output, overwrite=overwrite)
         self.confidence = confidence
@@ -46,8 +50,7 @@ class YoloWriter(Writer):
             for box, class_id, score in zip(boxes, perception.boxes.class_id, perception.boxes.confidence, strict=True):
                 values = " ".join(f"{value:.6f}" for value in box)
                 lines.append(f"{class_id} {values}" + (f" {score:.4f}" if self.confidence else "") + "\n")
-        path.write_text("".join(lines), encoding="utf-8")
-        self.files.append(path)
+        self.write_whole(path, "".join(lines))
         self._class_names = perception.class_names
 
     def close(self) -> None:
@@ -55,5 +58,4 @@ class YoloWriter(Writer):
         if self._class_names is None or self._data in self.files:
             return
         data = {"path": ".", "train": "images", "val": "images", "names": list(self._class_names)}
-        self._data.write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
-        self.files.append(self._data)
+        self.write_whole(self._data, yaml.safe_dump(data, sort_keys=False))
