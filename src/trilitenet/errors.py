@@ -17,9 +17,11 @@ the command line prints them as they are and exits 1.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 from types import ModuleType
 
 __all__ = [
@@ -36,6 +38,7 @@ __all__ = [
     "brief",
     "did_you_mean",
     "import_extra",
+    "writing",
 ]
 
 
@@ -107,3 +110,18 @@ def import_extra(module: str, extra: str) -> ModuleType:
         raise MissingExtraError(
             f"this needs {module!r} ({error}); install it with: pip install 'trilitenet[{extra}]'"
         ) from error
+
+
+@contextlib.contextmanager
+def writing(output: str | Path) -> Iterator[None]:
+    """Tell what the system says on writing, such as that the disk is full, in one line.
+
+    Raises:
+        OutputError: For any error of the system.
+    """
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, TriLiteNetError):
+            raise
+        raise OutputError(f"{error.filename or output}: cannot be written ({error.strerror or error})") from error

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -101,6 +103,20 @@ def test_show_sheets_and_pages(published: Path, tmp_path: Path) -> None:
     # Annotated images alternate between day and night; one night image has no annotation.
     assert page.count == 6
     assert (tmp_path / "night.html").read_text().count("<img") == 6
+    both = re.findall(r"<img[^>]*>", show(published, tmp_path / "both.html", count=2).output.read_text())
+    train, val = (
+        re.findall(r"<img[^>]*>", show(published, tmp_path / f"{split}.html", split=split, count=2).output.read_text())
+        for split in ("train", "val")
+    )
+    assert both == train + val
+    assert len(set(both)) == 4
+    wrong: dict[str, Any] = {"columns": 0, "seed": -1, "count": 0, "width": 0}
+    for name, value in wrong.items():
+        with pytest.raises(ConfigError, match=name):
+            show(published, tmp_path / "x.jpg", **{name: value})
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(OutputError, match="cannot be written"):
+        show(published, tmp_path / "file" / "x.jpg")
     rest = show(published, tmp_path / "rest.html", split="train", where=["timeofday=night"], start=4)
     assert rest.count == 2
     with pytest.raises(DataError, match="no image with timeofday=noon"):

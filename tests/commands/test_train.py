@@ -21,6 +21,7 @@ import trilitenet
 from trilitenet.commands.train import train
 from trilitenet.commands.train_table import train_table
 from trilitenet.config import TASKS
+from trilitenet.data.prepared import prepare
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.synthetic_files import write_dataset
 from trilitenet.engine import train as engine
@@ -28,7 +29,7 @@ from trilitenet.engine.checkpoint import read_checkpoint
 from trilitenet.engine.loggers import CsvLogger, read_csv
 from trilitenet.engine.predictions import PredictionWriter
 from trilitenet.engine.recipe import read_recipe
-from trilitenet.errors import ConfigError, OutputError, TrainingError, WeightsError
+from trilitenet.errors import ConfigError, DataError, OutputError, TrainingError, WeightsError
 from trilitenet.models.encoder import Encoder
 from trilitenet.models.trilitenet import TriLiteNet
 from trilitenet.models.weights import load_network, read_card
@@ -186,6 +187,28 @@ def test_the_best_is_never_replaced_by_a_worse_one(
     assert read_card(tmp_path / "best-drivable.safetensors").metrics["best drivable"] == 0.8
 
 
+def test_overwriting_leaves_nothing_of_the_earlier_run(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = iter([0.9, 0.1, 0.2])
+    monkeypatch.setattr("trilitenet.commands.train.validation_figures", lambda *_: {"drivable/miou": next(values)})
+    output = tmp_path / "run"
+    options = settings(scenes, output, val_split="val", tasks=("drivable",), pictures=0)
+    train(**options, max_steps=2)
+    assert (output / "best-drivable.safetensors").exists()
+    (output / "results" / "old.jpg").write_bytes(b"x")
+    (output / "notes.txt").write_text("mine")
+    (output / "last.ckpt").unlink()
+    with pytest.raises(OutputError, match="holds a run already"):
+        train(**options, max_steps=1)
+    train(overwrite=True, **options | {"val_split": ""}, max_steps=1)
+    assert not list(output.glob("best-*"))
+    assert not (output / "results" / "old.jpg").exists()
+    assert (output / "notes.txt").read_text() == "mine"
+    train(resume=True, **options, max_steps=4)
+    assert read_card(output / "best-drivable.safetensors").metrics["best drivable"] < 0.5
+
+
 def test_stops_early(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trilitenet.commands.train.validation_figures", lambda *_: {"drivable/miou": 0.5})
     options = settings(scenes, tmp_path, val_split="val", tasks=("drivable",), patience=2, pictures=0)
@@ -272,6 +295,19 @@ def test_refusals(scenes: Path, tmp_path: Path) -> None:
         train()
     with pytest.raises(ConfigError, match="did you mean 'epochs'"):
         train(epoch=3)
+    with pytest.raises(ConfigError, match="--sampling: not YAML"):
+        train(sampling="{a: [")
+    wrong: dict[str, Any] = {"betas": (1.5, 0.9), "seed": -1, "pictures": -1, "anchors": [[[-1, 2]] * 3] * 3}
+    for name, value in wrong.items():
+        with pytest.raises(ConfigError, match=name):
+            train(data="x", **{name: value})
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(OutputError, match=r"file.*cannot be written"):
+        train(**settings(scenes, tmp_path / "file" / "run", max_steps=1))
+    with pytest.raises(ConfigError, match="without data and output"):
+        train_table(TABLES[0], data=scenes, output=tmp_path, settings="{data: x}")
+    with pytest.raises(ConfigError, match="must be YAML"):
+        train_table(TABLES[0], data=scenes, output=tmp_path, settings="{a: [")
     with pytest.raises(WeightsError, match="no such checkpoint"):
         train(resume=True, **settings(scenes, tmp_path / "none"))
     train(**settings(scenes, tmp_path, max_steps=1))
@@ -281,6 +317,16 @@ def test_refusals(scenes: Path, tmp_path: Path) -> None:
         train(resume=True, **settings(scenes, tmp_path, max_steps=2, variant="small"))
     with pytest.raises(WeightsError, match="class count 1, this run has 2"):
         train(resume=True, **settings(scenes, tmp_path, max_steps=2, classes=("vehicle", "person")))
+
+
+def test_a_prepared_data_set_is_trained_on_without_validation(scenes: Path, tmp_path: Path) -> None:
+    prepare(scenes, tmp_path / "prepared", canvas=(64, 128), mask_above=64)
+    options = settings(tmp_path / "prepared", tmp_path / "run", max_steps=1)
+    with pytest.raises(DataError, match="--val-split '' to go without"):
+        train(**options | {"val_split": "val"})
+    with pytest.raises(DataError, match="prepared with --mask-above 64, 1 is wanted"):
+        train(**options)
+    assert train(augmentation__mask_above=64, **options).steps == 1
 
 
 @pytest.mark.parametrize("recipe", RECIPES, ids=lambda path: path.stem)

@@ -134,6 +134,7 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object]]] = {
     ),
     "index names no image": ("index", lambda root: (root / "index.csv").open("a").write("nobody,train,x\n")),
     "no such split": ("split-missing", lambda root: (root / "dataset.yaml").write_text("splits: [train, val, test]\n")),
+    "no such ego mask": ("ego-mask", lambda root: (root / "dataset.yaml").open("a").write("ego_mask: nope.png\n")),
     "odd shapes": (
         "anchors",
         lambda root: annotate(root, *(box(1, 1 + n / 10, 120, 1.5 + n / 10) for n in range(60))),
@@ -167,7 +168,7 @@ ONE_PLACE = (
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_faults_do_not_hide_one_another(root: Path) -> None:
     planted = {fault: FAULTS[fault] for fault in FAULTS if fault not in ONE_PLACE}
-    assert len(planted) == 15
+    assert len(planted) == 16
     for _, plant in planted.values():
         plant(root)
     assert kinds(check_dataset(root)) == {kind for kind, _ in planted.values()}

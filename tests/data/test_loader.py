@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from trilitenet.data.batches import Batch
 from trilitenet.data.loader import build_loader, epoch_order
 from trilitenet.data.reading import DrivingDataset, MixedDataset
 from trilitenet.data.transforms import Augmentation, EvalTransform, TrainTransform
-from trilitenet.errors import ConfigError
+from trilitenet.errors import ConfigError, DataError
 
 CANVAS = (64, 96)
 
@@ -56,6 +57,19 @@ def test_workers_change_nothing(dataset: DrivingDataset) -> None:
     for epoch, start in ((0, 0), (1, 2)):
         pairs = zip(alone.epoch(epoch, start=start), workers.epoch(epoch, start=start), strict=True)
         assert all(same(one, two) for one, two in pairs)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_broken_file_is_told_in_one_line(tmp_path: Path, workers: int) -> None:
+    write_published(tmp_path, "train", 4)
+    broken = tmp_path / "images/train/train_0002.jpg"
+    broken.write_bytes(broken.read_bytes()[:60])
+    loader = build_loader(
+        DrivingDataset(tmp_path, "train"), TrainTransform(CANVAS, Augmentation()), batch_size=2, workers=workers
+    )
+    with pytest.raises(DataError, match="train_0002") as caught:
+        list(loader)
+    assert "\n" not in str(caught.value)
 
 
 def test_without_shuffling_all_come_in_order(dataset: DrivingDataset) -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import logging
 import os
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from trilitenet.data.loader import build_loader
 from trilitenet.data.prepared import PreparedDataset, open_dataset, prepare
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.transforms import TrainTransform
-from trilitenet.errors import DataError, OutputError
+from trilitenet.errors import ConfigError, DataError, OutputError
 
 CANVAS = (64, 96)
 
@@ -89,6 +90,10 @@ def test_a_data_set_uses_its_prepared_copy_by_itself(root: Path, caplog: pytest.
     assert isinstance(open_dataset(root, "train"), DrivingDataset)  # wanted as they are
     assert isinstance(open_dataset(root, "train", canvas=(96, 96)), DrivingDataset)
     assert isinstance(open_dataset(root, "train", canvas=CANVAS, class_names=["car"]), DrivingDataset)
+    assert isinstance(open_dataset(root, "train", canvas=CANVAS, mask_above=1), PreparedDataset)
+    with caplog.at_level(logging.WARNING):
+        assert isinstance(open_dataset(root, "train", canvas=CANVAS, mask_above=64), DrivingDataset)
+    assert "prepared with --mask-above 1 and not used, as 64 is wanted" in caplog.text
     path = root / "da_seg_annotations/train/train_0000.png"
     path.unlink()
     with caplog.at_level(logging.WARNING):
@@ -144,6 +149,19 @@ def test_errors(root: Path, tmp_path: Path) -> None:
         prepare(root, tmp_path / "out", canvas=(96, 96))
     with pytest.raises(OutputError, match="not empty"):
         prepare(root, root)
+    faults: list[dict[str, Any]] = [
+        {"canvas": (100, 160)},
+        {"canvas": (0, 0)},
+        {"quality": 500},
+        {"mask_above": 300},
+        {"shard_size": 0},
+    ]
+    for fault in faults:
+        with pytest.raises(ConfigError):
+            prepare(root, tmp_path / "other", **{"canvas": CANVAS, **fault})
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(OutputError, match=r"file.*cannot be written"):
+        prepare(root, tmp_path / "file", canvas=CANVAS)
     with pytest.raises(DataError, match="no split 'test'"):
         PreparedDataset(tmp_path / "out", "test")
     with pytest.raises(DataError, match="prepared with the classes"):

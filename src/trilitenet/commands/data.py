@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import io
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -27,7 +27,7 @@ from trilitenet.data.prepared import prepare as run_preparation
 from trilitenet.data.reading import IMAGE_FOLDER, DrivingDataset
 from trilitenet.data.records import RecordSource
 from trilitenet.data.sample import Sample
-from trilitenet.errors import ConfigError, DataError, OutputError
+from trilitenet.errors import ConfigError, DataError, OutputError, writing
 from trilitenet.formats.readers.bdd100k import read_bdd100k
 from trilitenet.formats.readers.coco import read_coco
 from trilitenet.formats.readers.cvat import read_cvat
@@ -281,6 +281,9 @@ def show(
     """
     if output.suffix.lower() not in {".jpg", ".jpeg", ".png", ".html"}:
         raise OutputError(f"{output}: must end in .jpg, .png or .html")
+    for option, value, least in (("count", count, 1), ("columns", columns, 1), ("width", width, 16), ("seed", seed, 0)):
+        if value < least:
+            raise ConfigError(f"{option} must be at least {least}, got {value}")
     wanted = dict(_pair(item) for item in where)
     groups = {}
     for name in [split] if split else _splits(root):
@@ -293,7 +296,7 @@ def show(
     shown = sum(len(indices) for _, indices in groups.values())
     if output.suffix.lower() == ".html":
         pictures = {
-            f"{name}: {len(indices)} of {len(dataset)}": (_fitted(dataset, index, max(width, 480)) for index in indices)
+            f"{name}: {len(indices)} of {len(dataset)}": _all_fitted(dataset, indices, max(width, 480))
             for name, (dataset, indices) in groups.items()
         }
         _write(output, picture_page(f"{root.name} {' '.join(where)}".strip(), pictures))
@@ -301,7 +304,8 @@ def show(
         samples = [dataset[index] for dataset, indices in groups.values() for index in indices]
         names = next(iter(groups.values()))[0].class_names
         sheet = contact_sheet(samples, names, columns=columns, size=(width * 9 // 16, width))
-        output.parent.mkdir(parents=True, exist_ok=True)
+        with writing(output):
+            output.parent.mkdir(parents=True, exist_ok=True)
         if not cv2.imwrite(str(output), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR)):
             raise OutputError(f"{output}: cannot be written")
     return Shown(output, shown)
@@ -326,7 +330,9 @@ class Prepared:
     def summary(self) -> str:
         """Return a line for people."""
         counts = ", ".join(f"{count} {split}" for split, count in self.images.items())
-        use = "training uses it by itself" if self.by_itself else "give this folder as the data"
+        use = "training uses it by itself"
+        if not self.by_itself:
+            use = "to train on it, give it as --data with --val-split ''"
         return f"{counts} in {self.output} ({self.size / 2**20:.1f} MiB); {use}"
 
 
@@ -454,6 +460,11 @@ def _some_pictures(report: CheckReport, count: int) -> Any:
     return contact_sheet(samples, names) if samples else None
 
 
+def _all_fitted(dataset: DrivingDataset, indices: Iterable[int], width: int) -> Iterator[Any]:
+    """Yield the drawn images one by one: a page needs but one of them at a time."""
+    return (_fitted(dataset, index, width) for index in indices)
+
+
 def _fitted(dataset: DrivingDataset, index: int, width: int) -> Any:
     sample = dataset[index]
     drawn = draw_sample(sample, dataset.class_names)
@@ -467,11 +478,9 @@ def _workers(workers: int) -> int:
 
 
 def _write(path: Path, text: str) -> None:
-    try:
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def _rendered(table: Table) -> str:

@@ -22,7 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.text import Text
 
 from trilitenet.commands.load import load
-from trilitenet.errors import BackendError, InputError, OutputError, ShapeError, TriLiteNetError
+from trilitenet.errors import BackendError, InputError, OutputError, ShapeError, writing
 from trilitenet.formats.writers.base import Writer, find_writer, open_writer
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, Failure, FrameReader, Stills, find_sources
@@ -334,7 +334,7 @@ class _Job:
         began = time.perf_counter()
         interrupted = False
         with contextlib.ExitStack() as stack:
-            stack.enter_context(_writing(self.output))
+            stack.enter_context(writing(self.output))
             if self.sources:
                 self.output.mkdir(parents=True, exist_ok=True)
                 for name in self.formats:
@@ -479,17 +479,6 @@ def _write_jpeg(path: Path, image: NDArray[np.uint8]) -> None:
     except BaseException:
         Path(partial).unlink(missing_ok=True)
         raise
-
-
-@contextlib.contextmanager
-def _writing(output: Path) -> Iterator[None]:
-    """Tell what the system says on writing, such as that the disk is full, in one line."""
-    try:
-        yield
-    except OSError as error:
-        if isinstance(error, TriLiteNetError):
-            raise
-        raise OutputError(f"{error.filename or output}: cannot be written ({error.strerror or error})") from error
 
 
 class _Speed(ProgressColumn):

@@ -21,7 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from trilitenet.config import DEFAULT_ANCHORS, ModelCard
 from trilitenet.data.loader import build_loader
-from trilitenet.data.prepared import PreparedDataset, open_dataset
+from trilitenet.data.prepared import PreparedDataset, is_prepared, open_dataset
 from trilitenet.data.reading import DrivingDataset, MixedDataset, SampleSource, sampling_weights
 from trilitenet.data.sample import Sample
 from trilitenet.data.transforms import TrainTransform, Transform
@@ -32,9 +32,9 @@ from trilitenet.engine.loggers import build_loggers
 from trilitenet.engine.recipe import TrainConfig, merge, read_recipe
 from trilitenet.engine.results import write_results
 from trilitenet.engine.runtime import make_fabric
-from trilitenet.engine.train import CHECKPOINT_NAME, Trainer, TrainResult
+from trilitenet.engine.train import CHECKPOINT_NAME, Trainer, TrainResult, holds_run
 from trilitenet.engine.transfer import freeze, initialise
-from trilitenet.errors import ConfigError, OutputError
+from trilitenet.errors import ConfigError, DataError, OutputError
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.torch_backend import TorchBackend
 from trilitenet.losses.detection import DetectionLoss
@@ -70,8 +70,13 @@ def train(
         raise ConfigError("no data: give the root folder of a data set with --data")
     folder = Path(config.output)
     checkpoint = folder / CHECKPOINT_NAME
-    if checkpoint.exists() and not (resume or overwrite):
+    if holds_run(folder) and not (resume or overwrite):
         raise OutputError(f"{folder}: holds a run already; --resume it, --overwrite it, or give another --output")
+    if config.val_split and is_prepared(Path(config.data)):
+        raise DataError(
+            f"{config.data}: is prepared, and figures are measured on images as they are; give the data set that it "
+            "was made of (a copy in its .prepared is used by itself), or --val-split '' to go without"
+        )
     fabric = make_fabric(config.device, config.precision, devices=config.devices, num_nodes=config.num_nodes)
     torch.manual_seed(config.seed)
     with _Display(quiet=not fabric.is_global_zero) as display:
@@ -122,12 +127,18 @@ def train(
 
 
 def _training_data(config: TrainConfig) -> SampleSource:
-    first = open_dataset(config.data, config.train_split, canvas=config.input_size, class_names=config.classes)
+    above = config.augmentation.mask_above
+    first = open_dataset(
+        config.data, config.train_split, canvas=config.input_size, class_names=config.classes, mask_above=above
+    )
     if not config.extra_data:
         return first
     names = first.class_names
     more = [
-        (open_dataset(root, config.train_split, canvas=config.input_size, class_names=names), weight)
+        (
+            open_dataset(root, config.train_split, canvas=config.input_size, class_names=names, mask_above=above),
+            weight,
+        )
         for root, weight in config.extra_data.items()
     ]
     return MixedDataset([(first, 1.0), *more])
@@ -353,7 +364,10 @@ def _nested(fields: Mapping[str, Any]) -> dict[str, Any]:
         if value is None:
             continue
         if name in _YAML_FLAGS and isinstance(value, str):
-            value = yaml.safe_load(value)
+            try:
+                value = yaml.safe_load(value)
+            except yaml.YAMLError as error:
+                raise ConfigError(f"--{name.replace('__', '.')}: not YAML ({' '.join(str(error).split())})") from error
         first, *inner = name.split("__")
         for part in reversed(inner):
             value = {part: value}

@@ -87,9 +87,12 @@ def train_table(table: Path, /, *, data: Path, output: Path, resume: bool = Fals
         The table.
     """
     title, recipes = _read(table)
-    more = yaml.safe_load(settings) if settings else {}
-    if not isinstance(more, dict):
-        raise ConfigError(f"settings must be YAML such as '{{epochs: 10}}', got {settings!r}")
+    try:
+        more = yaml.safe_load(settings) if settings else {}
+    except yaml.YAMLError:
+        more = None
+    if not isinstance(more, dict) or {"data", "output"} & more.keys():
+        raise ConfigError(f"settings must be YAML such as '{{epochs: 10}}', without data and output, got {settings!r}")
     rows: list[TableRow] = []
     for name, recipe in recipes.items():
         folder = output / recipe.stem

@@ -53,6 +53,7 @@ KINDS: Final[dict[str, str]] = {
     "leak-near-duplicate": "nearly the same picture in two splits",
     "leak-sequence": "a sequence (index.csv) with images in two splits",
     "index": "index.csv and the images disagree",
+    "ego-mask": "a mask of the own car that dataset.yaml names and that cannot be read",
     "split-missing": "a split that dataset.yaml names and that has no images",
     "anchors": "too many boxes that no anchor fits",
 }
@@ -253,6 +254,9 @@ def check_dataset(
     _find_duplicates(facts, collector)
     _find_near_duplicates(facts, collector)
     _find_sequences(index, facts, collector)
+    for name in filter(None, {description.ego_mask, *description.ego_masks.values()}):
+        if cv2.imread(str(root / name), cv2.IMREAD_UNCHANGED) is None:
+            collector.add("ego-mask", "", name)
     for split in description.splits:
         if not names.get(split):
             collector.add("split-missing", split, f"{IMAGE_FOLDER}/{split}")

@@ -39,7 +39,7 @@ from trilitenet.data.lane_edges import centre_line, pair_edges
 from trilitenet.data.rasterise import draw_line, fill_polygon
 from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, IMAGE_FOLDER, LANE_FOLDER
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel, RecordSource, RunLabel
-from trilitenet.errors import ConfigError, DataError, OutputError
+from trilitenet.errors import ConfigError, DataError, OutputError, writing
 
 __all__ = ["ConversionOptions", "ConversionReport", "convert", "drivable_mask", "lane_mask"]
 
@@ -479,8 +479,9 @@ def _open_state(root: Path, options: ConversionOptions) -> Path:
         return state
     if root.is_dir() and any(root.iterdir()):
         raise OutputError(f"{root}: is not empty and not of an earlier conversion; choose another folder")
-    state.mkdir(parents=True, exist_ok=True)
-    _rewrite(path, text)
+    with writing(root):
+        state.mkdir(parents=True, exist_ok=True)
+        _rewrite(path, text)
     return state
 
 

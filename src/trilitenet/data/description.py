@@ -42,6 +42,10 @@ class MaskMeaning:
     values: dict[int, str] = dataclasses.field(default_factory=dict)
     ignore: tuple[int, ...] = ()
 
+    def __post_init__(self) -> None:
+        if wrong := [value for value in (self.above, *self.values, *self.ignore) if not 0 <= value <= 255]:
+            raise ConfigError(f"the values of a mask are 0 .. 255, got {', '.join(map(str, wrong))}")
+
 
 @dataclasses.dataclass(frozen=True)
 class DatasetDescription:

@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
 import cv2
@@ -22,7 +22,7 @@ from trilitenet.data.batches import Batch, collate
 from trilitenet.data.reading import MixedDataset, SampleSource
 from trilitenet.data.sample import Sample
 from trilitenet.data.transforms import Transform
-from trilitenet.errors import ConfigError
+from trilitenet.errors import ConfigError, TriLiteNetError
 
 __all__ = ["Loader", "build_loader", "epoch_order"]
 
@@ -71,7 +71,7 @@ class _Draw:
     index: int
 
 
-class _Samples(torch.utils.data.Dataset[Sample]):
+class _Samples(torch.utils.data.Dataset[Sample | TriLiteNetError]):
     """Transformed samples by `_Draw`."""
 
     def __init__(self, dataset: SampleSource, transform: Transform, seed: int) -> None:
@@ -79,12 +79,32 @@ class _Samples(torch.utils.data.Dataset[Sample]):
         self._transform = transform
         self._seed = seed
 
-    def __getitem__(self, draw: _Draw) -> Sample:
+    def __getitem__(self, draw: _Draw) -> Sample | TriLiteNetError:
+        """Return the sample, or why there is none: PyTorch would wrap what a worker raises into pages of text."""
         rng = np.random.default_rng([self._seed, _SAMPLE_STREAM, draw.epoch, draw.position])
-        return self._transform(self._dataset[draw.index], rng, self._other)
+        try:
+            return self._transform(self._dataset[draw.index], rng, self._other)
+        except TriLiteNetError as error:
+            return error
 
     def _other(self, rng: np.random.Generator) -> Sample:
         return self._dataset[int(rng.integers(len(self._dataset)))]
+
+
+def _collate(samples: list[Sample | TriLiteNetError]) -> Batch | TriLiteNetError:
+    whole: list[Sample] = []
+    for sample in samples:
+        if isinstance(sample, TriLiteNetError):
+            return sample
+        whole.append(sample)
+    return collate(whole)
+
+
+def _batches(loader: Iterable[Batch | TriLiteNetError]) -> Iterator[Batch]:
+    for batch in loader:
+        if isinstance(batch, TriLiteNetError):
+            raise batch
+        yield batch
 
 
 class _Plan(torch.utils.data.Sampler[list[_Draw]]):
@@ -146,10 +166,10 @@ class Loader:
             # OpenCV's threads, which a fork leaves behind.
             cv2.setNumThreads(0)
         more: dict[str, Any] = {"persistent_workers": True, "prefetch_factor": 4} if workers else {}
-        self._loader: torch.utils.data.DataLoader[Batch] = torch.utils.data.DataLoader(
+        self._loader: torch.utils.data.DataLoader[Batch | TriLiteNetError] = torch.utils.data.DataLoader(
             _Samples(dataset, transform, seed),  # type: ignore[arg-type]
             batch_sampler=self._plan,
-            collate_fn=collate,
+            collate_fn=_collate,
             num_workers=workers,
             pin_memory=pin_memory,
             worker_init_fn=_start_worker,
@@ -185,7 +205,7 @@ class Loader:
             batch[index * len(batch) // count : (index + 1) * len(batch) // count]
             for batch in batches[start : len(self)]
         ]
-        return iter(self._loader)
+        return _batches(self._loader)
 
 
 def build_loader(

@@ -30,7 +30,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import Task
+from trilitenet.config import MAX_STRIDE, Task
 from trilitenet.data.description import read_description
 from trilitenet.data.reading import (
     DETECTION_FOLDER,
@@ -42,7 +42,7 @@ from trilitenet.data.reading import (
     decode_image,
 )
 from trilitenet.data.sample import Sample
-from trilitenet.errors import DataError, OutputError, import_extra
+from trilitenet.errors import ConfigError, DataError, OutputError, import_extra, writing
 from trilitenet.processing.letterbox import Letterbox
 
 __all__ = ["PREPARED_FILE", "PreparedDataset", "is_prepared", "open_dataset", "prepare", "shrink"]
@@ -133,19 +133,22 @@ def prepare(
         Split -> number of images.
 
     Raises:
+        ConfigError: If a number is out of range.
         OutputError: If ``out`` holds something else, or was made with other settings.
         DataError: If the data set is broken.
     """
     root = Path(root)
     out = Path(out) if out is not None else root / CACHE_FOLDER
     names = tuple(class_names or read_description(root).class_names)
+    _check(canvas, quality, mask_above, shard_size)
     plan = _Plan(root, out, canvas, names, images, quality, mask_above)
     folders = sorted(path.name for path in (root / IMAGE_FOLDER).glob("*") if path.is_dir())
     chosen = list(splits) if splits is not None else folders
     if not chosen:
         raise DataError(f"{root}: no splits below {IMAGE_FOLDER}; expected the published layout, see docs/data.md")
     datasets = {split: DrivingDataset(root, split, class_names=names) for split in chosen}
-    _open_out(plan)
+    with writing(out):
+        _open_out(plan)
     jobs = [
         (split, number, dataset.names[first : first + shard_size])
         for split, dataset in datasets.items()
@@ -174,6 +177,7 @@ def open_dataset(
     class_names: Sequence[str] | None = None,
     classes: Mapping[str, Sequence[str]] | None = None,
     tasks: Sequence[Task] | None = None,
+    mask_above: int | None = None,
 ) -> DrivingDataset | PreparedDataset:
     """Open a split of a data set, whatever its layout.
 
@@ -187,13 +191,19 @@ def open_dataset(
         class_names: Detection classes; those of the data set if left out.
         classes: Class name -> categories; with it, no prepared copy is used.
         tasks: Read the labels of these alone.
+        mask_above: A resized mask pixel above this, of 255, shall be foreground; None takes any prepared copy.
 
     Raises:
-        DataError: If there is no such split.
+        DataError: If there is no such split, or a prepared data set has masks made otherwise.
     """
     root = Path(root)
     if is_prepared(root):
         prepared = PreparedDataset(root, split, class_names=class_names, tasks=tasks)
+        if mask_above not in (None, prepared.mask_above):
+            raise DataError(
+                f"{root}: prepared with --mask-above {prepared.mask_above}, {mask_above} is wanted; prepare it again, "
+                f"or set augmentation.mask_above to {prepared.mask_above}"
+            )
         if canvas is not None and prepared.canvas != canvas:
             _logger.warning("%s: prepared for %s, used at %s", root, prepared.canvas, canvas)
         return prepared
@@ -203,6 +213,11 @@ def open_dataset(
         wanted = list(class_names or read_description(root).class_names)
         if state["canvas"] != list(canvas) or state["class_names"] != wanted or split not in state["splits"]:
             _logger.info("%s: the prepared copy is for something else and is not used", root)
+        elif mask_above not in (None, state["mask_above"]):
+            _logger.warning(
+                "%s: prepared with --mask-above %d and not used, as %d is wanted; prepare it with that",
+                cache, state["mask_above"], mask_above,
+            )  # fmt: skip
         elif state["splits"][split] != _fingerprint(root, split):
             _logger.warning("%s: changed since it was prepared; run `trilitenet data prepare` again", root)
         else:
@@ -238,6 +253,7 @@ class PreparedDataset:
         self.split = split
         state = _read_state(self._place.file(PREPARED_FILE).parent)
         self.canvas: tuple[int, int] = (state["canvas"][0], state["canvas"][1])
+        self.mask_above: int = state["mask_above"]
         self._class_names = tuple(state["class_names"])
         if class_names is not None and tuple(class_names) != self._class_names:
             raise DataError(
@@ -465,6 +481,16 @@ def _settings(plan: _Plan) -> dict[str, Any]:
         "quality": plan.quality,
         "mask_above": plan.mask_above,
     }
+
+
+def _check(canvas: tuple[int, int], quality: int, mask_above: int, shard_size: int) -> None:
+    if min(canvas) < MAX_STRIDE or any(side % MAX_STRIDE for side in canvas):
+        raise ConfigError(f"the size must be multiples of {MAX_STRIDE}, as training's is, got {canvas}")
+    if not (1 <= quality <= 100 and 0 <= mask_above <= 254 and shard_size >= 1):
+        raise ConfigError(
+            "quality must be in 1 .. 100, mask_above in 0 .. 254 and shard_size at least 1, "
+            f"got {quality}, {mask_above} and {shard_size}"
+        )
 
 
 def _open_out(plan: _Plan) -> None:

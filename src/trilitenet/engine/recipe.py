@@ -164,6 +164,8 @@ class TrainConfig:
             "workers",
             "max_steps",
             "patience",
+            "pictures",
+            "seed",
         ):
             if getattr(self, name) < 0:
                 raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
@@ -179,6 +181,10 @@ class TrainConfig:
             )
         if not self.lr > 0:
             raise ConfigError(f"lr must be above 0, got {self.lr}")
+        if not all(0 <= beta < 1 for beta in self.betas):
+            raise ConfigError(f"betas must be in [0, 1), got {self.betas}")
+        if self.anchors is not None and not all(side > 0 for level in self.anchors for pair in level for side in pair):
+            raise ConfigError(f"anchors must be above 0, got {self.anchors}")
         if not 0 <= self.ema_decay < 1:
             raise ConfigError(f"ema_decay must be in [0, 1), got {self.ema_decay}")
 

@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import logging
 import math
+import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -26,18 +27,21 @@ from trilitenet.engine.recipe import TrainConfig
 from trilitenet.engine.rescale import draw_size, rescale
 from trilitenet.engine.runtime import StopRequest
 from trilitenet.engine.transfer import keep_frozen
-from trilitenet.errors import WeightsError
+from trilitenet.errors import WeightsError, writing
 from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.losses.multitask import LossTerms, MultiTaskLoss
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
 from trilitenet.models.weights import read_card, save_network
 
-__all__ = ["CHECKPOINT_NAME", "FIGURES", "TrainResult", "Trainer"]
+__all__ = ["CHECKPOINT_NAME", "FIGURES", "TrainResult", "Trainer", "holds_run"]
 
 log = logging.getLogger(__name__)
 
 CHECKPOINT_NAME: Final = "last.ckpt"
 """The checkpoint in the run's folder that `--resume` continues from."""
+
+_RESULTS: Final = (CHECKPOINT_NAME, "final.safetensors", "best-*.safetensors")
+_TRACES: Final = ("config.yaml", "metrics.csv", "results", "tensorboard")
 
 FIGURES: Final = {"detection": "detection/ap50", "drivable": "drivable/miou", "lane": "lane/iou"}
 """The figure each task is judged by; the mean of these is the overall one."""
@@ -197,8 +201,11 @@ class Trainer:
         if resume is not None:
             self.load(resume)
         if self.fabric.is_global_zero:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            (self.folder / "config.yaml").write_text(yaml.safe_dump(self.config.to_dict(), sort_keys=False))
+            with writing(self.folder):
+                if resume is None:
+                    _forget(self.folder)
+                self.folder.mkdir(parents=True, exist_ok=True)
+                (self.folder / "config.yaml").write_text(yaml.safe_dump(self.config.to_dict(), sort_keys=False))
             self.loggers = build_loggers(self.step)
         try:
             finished = self._run()
@@ -428,3 +435,17 @@ class Trainer:
     def _scaler_state(self) -> dict[str, Any]:
         state: dict[str, Any] = self.fabric._precision.state_dict()
         return state
+
+
+def holds_run(folder: Path) -> bool:
+    """Return whether a folder has a run's state or weights, which a new run would replace."""
+    return any(True for pattern in _RESULTS for _ in folder.glob(pattern))
+
+
+def _forget(folder: Path) -> None:
+    """Remove what an earlier run left, so that none of it is taken for the new one's."""
+    for path in [path for pattern in (*_RESULTS, *_TRACES) for path in folder.glob(pattern)]:
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
