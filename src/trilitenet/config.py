@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
@@ -188,6 +189,15 @@ class ModelCard:
     notes: tuple[str, ...] = ()
     schema: int = CARD_SCHEMA
 
+    def __post_init__(self) -> None:
+        if [len(level) for level in self.anchors] != [3] * len(STRIDES):
+            raise ConfigError(
+                f"anchors must be {len(STRIDES)} levels of 3 sizes, got {[len(level) for level in self.anchors]}"
+            )
+        for side in (side for level in self.anchors for pair in level for side in pair):
+            if not 0 < side < math.inf:
+                raise ConfigError(f"anchors must be above 0 and finite, got {side}")
+
     @property
     def classes(self) -> int:
         """Number of detection classes."""
@@ -331,8 +341,16 @@ def _read_versioned(cls: type[_T], text: str, source: str, names: tuple[str, str
         raise WeightsError(f"{source}: its {what} is not JSON ({error})") from error
     if not isinstance(mapping, dict):
         raise WeightsError(f"{source}: its {what} is not a JSON object")
-    schema = mapping.get("schema")
-    if not isinstance(schema, int) or schema > newest:
+    if "schema" not in mapping:
+        raise WeightsError(
+            f"{source}: its {what} has no schema, which tells the layout; the file is damaged or foreign"
+        )
+    schema = mapping["schema"]
+    if not isinstance(schema, int):
+        raise WeightsError(
+            f"{source}: {schema_name} schema must be a whole number, got {schema!r}; the file is damaged"
+        )
+    if schema > newest:
         raise WeightsError(
             f"{source}: {schema_name} schema {schema!r} is newer than {newest}, which this version reads; "
             "upgrade trilitenet"
@@ -373,4 +391,7 @@ def _explain(cls: type[Any], error: ValidationError) -> str:
         return f"unknown key {path!r}{did_you_mean(str(first['loc'][-1]), names)}"
     if first["type"] in {"missing", "missing_argument"}:
         return f"missing key {path!r}"
-    return f"{path}: {first['msg']}, got {first.get('input')!r}"
+    where = f"{path}: " if path else ""
+    if first["type"] == "value_error":  # raised by a dataclass itself; the input is all of its fields
+        return f"{where}{first['ctx']['error']}"
+    return f"{where}{first['msg']}, got {first.get('input')!r}"

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Literal
 
 import pytest
 
@@ -53,3 +54,12 @@ def test_cost_table() -> None:
 def test_numbers_must_be_positive() -> None:
     with pytest.raises(ConfigError, match="at least 1"):
         benchmark(rounds=0)
+
+
+@pytest.mark.parametrize("size", [(0, 0), (-32, 64), (100, 128)])
+@pytest.mark.parametrize("table", ["latency", "cost"])
+def test_a_size_that_the_network_cannot_take_is_refused(
+    size: tuple[int, int], table: Literal["latency", "cost"]
+) -> None:
+    with pytest.raises(ConfigError, match=f"--size must be multiples of 32, got {size[0]}x{size[1]}"):
+        benchmark(size=size, table=table)

@@ -121,6 +121,18 @@ def test_a_missing_split_is_told(data: Path, weights: Path) -> None:
         evaluate(str(weights), data=data, split="test")
 
 
+@pytest.mark.parametrize(("option", "resamples", "worst"), [("resamples", -1, 0), ("worst", 0, -1)])
+def test_negative_counts_are_refused_before_the_work(
+    option: str, resamples: int, worst: int, run: tuple[Report, Path], data: Path, weights: Path, tmp_path: Path
+) -> None:
+    message = f"--{option} must not be negative, got -1; 0 is for none"
+    with pytest.raises(ConfigError, match=message):
+        evaluate(str(weights), data=data, save=tmp_path / "out", resamples=resamples, worst=worst)
+    with pytest.raises(ConfigError, match=message):
+        score(run[1] / "predictions", data=data, output=tmp_path / "out", resamples=resamples, worst=worst)
+    assert not (tmp_path / "out").exists()
+
+
 def test_scoring_and_comparing_load_no_torch() -> None:
     code = "import sys, trilitenet.commands.score, trilitenet.commands.compare; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

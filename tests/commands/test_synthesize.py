@@ -17,3 +17,19 @@ def test_synthesize_writes_the_published_layout(tmp_path: Path, capsys: pytest.C
         assert len(list((tmp_path / "out" / folder / "val").glob(f"*.{ending}"))) == 2
     assert main(words) == 1
     assert "not empty" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--seed", "-1"], "seed must not be negative, got -1"),
+        (["--size", "0", "0"], "size must be at least 32 pixels each way"),
+        (["--count", "0"], "count and workers must be at least 1"),
+    ],
+)
+def test_wrong_options_leave_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    assert main(["data", "synthesize", str(tmp_path / "out"), *words]) == 1
+    assert capsys.readouterr().err.startswith(f"error: {message}")
+    assert not (tmp_path / "out").exists()

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tests.models.conftest import golden as golden
 from tests.models.conftest import published_state
+from trilitenet.apps.cli import main
 from trilitenet.commands.synthesize import synthesize
 from trilitenet.commands.weights import finish, import_weights, info
 from trilitenet.errors import ConfigError, OutputError, WeightsError
@@ -84,6 +85,32 @@ def test_a_card_text_with_an_unknown_key_is_refused_before_the_work(scenes: Path
     with pytest.raises(ConfigError, match="licence"):
         finish("tiny", tmp_path / "out.safetensors", data=scenes, card=(tmp_path / "card.yaml",))
     assert not (tmp_path / "out.safetensors").exists()
+
+
+@pytest.mark.parametrize("size", [(100, 160), (0, 160), (-32, 64)])
+def test_an_input_size_that_the_network_cannot_take_is_refused(
+    scenes: Path, tmp_path: Path, size: tuple[int, int]
+) -> None:
+    with pytest.raises(ConfigError, match=f"--input-size must be multiples of 32, got {size[0]}x{size[1]}"):
+        finish("tiny", tmp_path / "out.safetensors", data=scenes, input_size=size)
+    assert not list(tmp_path.iterdir())
+
+
+def test_finishing_into_a_file_that_is_taken_for_a_folder(scenes: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="cannot write the weights"):
+        finish("tiny", tmp_path / "file" / "out.safetensors", data=scenes)
+
+
+def test_a_training_state_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    state = tmp_path / "last.ckpt"
+    torch.save({"schema": 1, "config": {}, "network": {}, "optimiser": {}}, state)
+    for words in (["info", str(state)], ["import", str(state), str(tmp_path / "out.safetensors")]):
+        assert main(["weights", *words]) == 1
+        error = capsys.readouterr().err
+        assert error.startswith(f"error: {state}: is a training state")
+        assert error.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["last.ckpt"]
 
 
 def test_every_shipped_file_says_what_it_is() -> None:

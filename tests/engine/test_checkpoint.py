@@ -4,6 +4,7 @@ import random
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,15 @@ from trilitenet.engine.checkpoint import random_state, read_checkpoint, set_rand
 from trilitenet.errors import OutputError, WeightsError
 
 
+def whole(**fields: Any) -> dict[str, Any]:
+    """Return all that a checkpoint must hold."""
+    names = ("config", "network", "optimiser", "loss", "best", "metrics", "random")
+    return {"step": 0, "ema": None, **{name: {} for name in names}, **fields}
+
+
 def test_state_goes_round(tmp_path: Path) -> None:
     path = tmp_path / "run" / "last.ckpt"
-    write_checkpoint(path, {"step": 3, "network": {"w": torch.arange(3)}})
+    write_checkpoint(path, whole(step=3, network={"w": torch.arange(3)}))
     state = read_checkpoint(path)
     assert state["step"] == 3
     assert state["network"]["w"].tolist() == [0, 1, 2]
@@ -23,7 +30,7 @@ def test_state_goes_round(tmp_path: Path) -> None:
 
 
 def test_random_states_go_round(tmp_path: Path) -> None:
-    write_checkpoint(tmp_path / "c", {"random": random_state()})
+    write_checkpoint(tmp_path / "c", whole(random=random_state()))
 
     def draw() -> list[float]:
         return [float(torch.rand(())), float(np.random.rand()), random.random()]  # noqa: NPY002
@@ -35,7 +42,7 @@ def test_random_states_go_round(tmp_path: Path) -> None:
 
 def test_killed_in_the_middle_of_writing_leaves_the_old_one(tmp_path: Path) -> None:
     path = tmp_path / "last.ckpt"
-    write_checkpoint(path, {"step": 1})
+    write_checkpoint(path, whole(step=1))
     script = f"""
 import os, signal, torch
 from trilitenet.engine import checkpoint
@@ -48,11 +55,11 @@ checkpoint.write_checkpoint({str(path)!r}, {{"step": 2}})
     done = subprocess.run([sys.executable, "-c", script], check=False, timeout=120)
     assert done.returncode == -9
     assert read_checkpoint(path)["step"] == 1
-    write_checkpoint(path, {"step": 3})
+    write_checkpoint(path, whole(step=3))
     assert read_checkpoint(path)["step"] == 3
 
 
-@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 cut"])
+@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 cut", b"\x80\x02."])
 def test_a_damaged_file_is_named(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "bad.ckpt"
     path.write_bytes(content)
@@ -66,6 +73,23 @@ def test_a_missing_file_and_a_newer_layout_are_refused(tmp_path: Path) -> None:
     torch.save({"schema": 99}, tmp_path / "new.ckpt")
     with pytest.raises(WeightsError, match="newer than this version"):
         read_checkpoint(tmp_path / "new.ckpt")
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        ({"schema": 1}, r"damaged \('config' is missing\); start anew"),
+        ({"schema": "x"}, "is not a checkpoint"),
+        ({"schema": 1} | whole(step="3"), "'step' is of the wrong type"),
+        ({"schema": 1} | whole(ema=[]), "'ema' is of the wrong type"),
+        (whole(), "is not a checkpoint"),
+        ([1], "is not a checkpoint"),
+    ],
+)
+def test_what_a_checkpoint_lacks_is_named(tmp_path: Path, state: object, message: str) -> None:
+    torch.save(state, tmp_path / "bad.ckpt")
+    with pytest.raises(WeightsError, match=message):
+        read_checkpoint(tmp_path / "bad.ckpt")
 
 
 def test_code_in_a_file_is_not_run(tmp_path: Path) -> None:

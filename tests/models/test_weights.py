@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import pickle
 from pathlib import Path
@@ -104,6 +105,35 @@ def test_files_that_are_not_weights(tmp_path: Path, saved: Path) -> None:
             load_network(tmp_path / name)
 
 
+def training_state(path: Path) -> Path:
+    torch.save({"schema": 1, "config": {}, "step": 1, "network": {}, "ema": None, "optimiser": {}}, path)
+    return path
+
+
+def test_a_training_state_is_told_from_weights(tmp_path: Path) -> None:
+    path = training_state(tmp_path / "last.ckpt")
+    for read in (read_card, load_network, lambda path: import_published(path, tmp_path / "out.safetensors")):
+        with pytest.raises(WeightsError, match=r"training state.* final\.safetensors .*best-\*\.safetensors beside"):
+            read(path)
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+@pytest.mark.parametrize(
+    ("anchors", "message"),
+    [
+        ([[[7, 6]] * 3] * 2, r"levels of 3 sizes, got \[3, 3\]"),
+        ([[[7, 6]] * 3], r"levels of 3 sizes, got \[3\]"),
+        ([[[7, 6]] * 3, [[7, 6]] * 3, [[7, 6], [7, -6], [7, 6]]], "above 0 and finite, got -6"),
+    ],
+)
+def test_a_card_with_unusable_anchors_is_refused(saved: Path, anchors: list[Any], message: str) -> None:
+    card = json.loads(ModelCard("tiny").to_json()) | {"anchors": anchors}
+    save_file(load_file(saved), saved, metadata={CARD_KEY: json.dumps(card)})
+    for read in (read_card, load_network):
+        with pytest.raises(WeightsError, match=rf"net\.safetensors: anchors must be .*{message}"):
+            read(saved)
+
+
 def test_an_unknown_key_in_the_card_names_the_nearest(saved: Path) -> None:
     card = ModelCard("tiny").to_json().replace('"licence"', '"license"')
     save_file(load_file(saved), saved, metadata={CARD_KEY: card})
@@ -151,6 +181,9 @@ def test_import_refuses_what_is_not_a_checkpoint(golden: dict[str, NDArray[Any]]
     state = published_state("tiny", golden)
     torch.save(state, tmp_path / "good.pth")
     (tmp_path / "cut.pth").write_bytes((tmp_path / "good.pth").read_bytes()[:100_000])
+    network = build_network("tiny")
+    save_network(network, tmp_path / "whole.safetensors", network.card)
+    (tmp_path / "cut.safetensors").write_bytes((tmp_path / "whole.safetensors").read_bytes()[:20_000])
     (tmp_path / "text.pth").write_text("hello")
     (tmp_path / "empty.pth").touch()
     (tmp_path / "code.pth").write_bytes(pickle.dumps({"a": _Code()}))
@@ -162,6 +195,7 @@ def test_import_refuses_what_is_not_a_checkpoint(golden: dict[str, NDArray[Any]]
     torch.save({k: v for k, v in state.items() if "anchor_grid" not in k}, tmp_path / "anchors.pth")
     cases = {
         "cut.pth": "truncated",
+        "cut.safetensors": "ends in .safetensors, but is not such a file, or is truncated",
         "text.pth": "not a PyTorch checkpoint",
         "empty.pth": "is empty",
         "code.pth": "holds code",

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 import trilitenet
 from trilitenet.commands.load import load
-from trilitenet.config import VARIANTS
+from trilitenet.config import MAX_STRIDE, VARIANTS
 from trilitenet.errors import ConfigError, OutputError, import_extra
 from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.cores import usable_cores
@@ -163,11 +163,13 @@ def benchmark(
         The measurements.
 
     Raises:
-        ConfigError: If there is nothing to measure, or a number is not positive.
+        ConfigError: If there is nothing to measure, a number is not positive, or the size is not of multiples of 32.
         OutputError: If a file cannot be written.
     """
     if min(rounds, *batch) < 1 or warmup < 0:
         raise ConfigError("--rounds and --batch must be at least 1, --warmup not negative")
+    if min(size) < MAX_STRIDE or any(side % MAX_STRIDE for side in size):
+        raise ConfigError(f"--size must be multiples of {MAX_STRIDE}, got {size[0]}x{size[1]}")
     machine = _machine(threads, streams)
     if table == "cost":
         result = Benchmark((), _costs(size), machine, 0, None)

@@ -82,7 +82,12 @@ def evaluate(
 
     Returns:
         The report.
+
+    Raises:
+        ConfigError: If a count is negative, or an artefact has decided already what a protocol decides.
+        OutputError: If there is a report already.
     """
+    check_counts(resamples, worst)
     check_output(output, overwrite)
     predictor = load(
         model,
@@ -194,6 +199,17 @@ def hash_dataset(dataset: DrivingDataset, limit: int | None = None) -> dict[str,
         "lane": hash_files(root / LANE_FOLDER / split / f"{name}.png" for name in names),
         "boxes": hash_files(root / DETECTION_FOLDER / split / f"{name}.json" for name in names),
     }
+
+
+def check_counts(resamples: int, worst: int) -> None:
+    """Refuse, before hours of work, counts that are negative.
+
+    Raises:
+        ConfigError: If one is.
+    """
+    for option, value in (("resamples", resamples), ("worst", worst)):
+        if value < 0:
+            raise ConfigError(f"--{option} must not be negative, got {value}; 0 is for none")
 
 
 def check_output(output: Path | None, overwrite: bool) -> None:

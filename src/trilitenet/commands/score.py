@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from trilitenet.commands.evaluate import check_output, hash_dataset, write_report
+from trilitenet.commands.evaluate import check_counts, check_output, hash_dataset, write_report
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.evaluate import score_predictions
 from trilitenet.engine.predictions import DETECTIONS_FILE, SavedPredictions
@@ -53,7 +53,12 @@ def score(
 
     Returns:
         The report.
+
+    Raises:
+        ConfigError: If a count is negative.
+        OutputError: If there is a report already.
     """
+    check_counts(resamples, worst)
     check_output(output, overwrite)
     dataset = DrivingDataset(data, split, class_names=tuple(classes))
     saved = SavedPredictions(predictions, classes)
@@ -84,8 +89,3 @@ def score(
     )
     write_report(report, output)
     return report
-
-
-def _hash_predictions(folder: Path, names: Sequence[str]) -> str:
-    masks = [folder / task / f"{name}.png" for task in ("drivable", "lane") for name in names]
-    return hash_files([folder / DETECTIONS_FILE, *masks])

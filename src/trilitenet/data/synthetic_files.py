@@ -52,11 +52,14 @@ def write_dataset(
         progress: Called with the number of scenes done after each.
 
     Raises:
-        ConfigError: If ``count`` or ``workers`` is under 1.
+        ConfigError: If ``count`` or ``workers`` is under 1, the seed negative, or the size too small.
         OutputError: If the split exists already, or a file cannot be written.
     """
     if count < 1 or workers < 1:
         raise ConfigError(f"count and workers must be at least 1, got {count} and {workers}")
+    if seed < 0:
+        raise ConfigError(f"seed must not be negative, got {seed}")
+    SyntheticScenes(seed, size, count, labels=labels)  # refuses a wrong size before there is a folder
     root = Path(root)
     if any((root / FOLDERS[0] / split).glob("*")):
         raise OutputError(f"{root / FOLDERS[0] / split} is not empty; choose another folder or split, or remove it")

@@ -19,13 +19,26 @@ __all__ = ["CHECKPOINT_SCHEMA", "random_state", "read_checkpoint", "set_random_s
 CHECKPOINT_SCHEMA: Final = 1
 """Version of the layout; a checkpoint of a newer one is refused."""
 
+_KEYS: Final[dict[str, type | tuple[type, ...]]] = {
+    "config": dict,
+    "step": int,
+    "network": dict,
+    "ema": (dict, type(None)),
+    "optimiser": dict,
+    "loss": dict,
+    "best": dict,
+    "metrics": dict,
+    "random": dict,
+}
+"""What every checkpoint holds, and its types."""
+
 
 def write_checkpoint(path: str | Path, state: dict[str, Any]) -> None:
     """Write a checkpoint so that the file is at any time either the old or the new one, whole.
 
     Args:
         path: Where to; a checkpoint that is there is replaced in one step, once the new one is on the disk.
-        state: Plain values and tensors.
+        state: Plain values and tensors; `read_checkpoint` asks for the keys that the trainer writes.
 
     Raises:
         OutputError: If it cannot be written.
@@ -58,15 +71,25 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         raise WeightsError(f"{path}: no such checkpoint to resume from")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
-        raise WeightsError(f"{path}: is not a checkpoint of this package, or is damaged") from error
-    if not isinstance(state, dict) or "schema" not in state:
-        raise WeightsError(f"{path}: is not a checkpoint of this package")
+    except (
+        OSError, RuntimeError, EOFError, ValueError, LookupError, AttributeError, TypeError, pickle.UnpicklingError,
+    ) as error:  # fmt: skip
+        raise _foreign(path) from error
+    if not isinstance(state, dict) or not isinstance(state.get("schema"), int):
+        raise _foreign(path)
     if state["schema"] > CHECKPOINT_SCHEMA:
         raise WeightsError(
             f"{path}: checkpoint layout {state['schema']} is newer than this version; upgrade trilitenet"
         )
+    for key, kind in _KEYS.items():
+        if key not in state or not isinstance(state[key], kind):
+            what = "of the wrong type" if key in state else "missing"
+            raise _foreign(path, f" ({key!r} is {what})")
     return state
+
+
+def _foreign(path: Path, why: str = "") -> WeightsError:
+    return WeightsError(f"{path}: is not a checkpoint of this package, or is damaged{why}; start anew with --overwrite")
 
 
 def random_state() -> dict[str, Any]:

@@ -76,6 +76,9 @@ _RENAMES: Final = (
 )
 """Published key prefixes and ours; the first match wins."""
 
+_TRAINING_STATE: Final = frozenset({"schema", "config", "network", "optimiser"})
+"""Keys that tell the training state of `trilitenet train` from other pickles."""
+
 
 def shipped_weights() -> dict[str, Path]:
     """Return the weight files that come with the package, by variant name."""
@@ -251,9 +254,7 @@ def _open(path: Path, *, tensors: bool) -> tuple[ModelCard, dict[str, Tensor]]:
             return card, {key: file.get_tensor(key) for key in keys}
     except SafetensorError as error:
         if _is_pickle(path):
-            raise WeightsError(
-                f"{path}: is a pickled checkpoint; convert it first: trilitenet weights import {path} OUT.safetensors"
-            ) from error
+            raise WeightsError(_about_pickle(path)) from error
         raise WeightsError(f"{path}: is not a safetensors file, or is truncated ({error})") from error
     except ValueError as error:
         raise WeightsError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
@@ -264,6 +265,28 @@ def _is_pickle(path: Path) -> bool:
         return True
     with path.open("rb") as file:
         return file.read(2) in {b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"}
+
+
+def _about_pickle(path: Path) -> str:
+    """Return why a pickle is not weights, and what to do."""
+    try:
+        state = _load_pickle(path)
+    except WeightsError:
+        state = None  # the import says what is wrong with it
+    if _is_training_state(state):
+        return _about_training_state(path)
+    return f"{path}: is a pickled checkpoint; convert it first: trilitenet weights import {path} OUT.safetensors"
+
+
+def _is_training_state(state: object) -> bool:
+    return isinstance(state, dict) and state.keys() >= _TRAINING_STATE
+
+
+def _about_training_state(path: Path) -> str:
+    return (
+        f"{path}: is a training state, to --resume from; the weights are final.safetensors (once the run has ended) "
+        "or best-*.safetensors beside it"
+    )
 
 
 def _load_strictly(network: TriLiteNet, tensors: Mapping[str, Tensor], source: str, *, published: bool = False) -> None:
@@ -289,7 +312,8 @@ def _list(what: str, keys: list[str]) -> str:
     return f"{what} {', '.join(keys[:3])}{more}; "
 
 
-def _read_pickle(path: Path) -> dict[str, Tensor]:
+def _load_pickle(path: Path) -> Any:
+    """Load what a pickle holds, of tensors and plain values; code in it is refused."""
     if not path.is_file():
         raise WeightsError(f"{path}: {'is a folder' if path.is_dir() else 'does not exist'}")
     if path.stat().st_size == 0:
@@ -297,7 +321,7 @@ def _read_pickle(path: Path) -> dict[str, Tensor]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # on pickle protocols: what cannot be read raises below
-            state: Any = torch.load(path, map_location="cpu", weights_only=True)
+            return torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         text = str(error)
         found = re.search(r"(?:GLOBAL|global) (\S+)", text)
@@ -308,6 +332,16 @@ def _read_pickle(path: Path) -> dict[str, Tensor]:
         raise WeightsError(f"{path}: is not a PyTorch checkpoint, or is truncated") from error
     except (RuntimeError, EOFError, OSError, ValueError, KeyError, IndexError, AttributeError, TypeError) as error:
         raise WeightsError(f"{path}: is not a PyTorch checkpoint, or is truncated") from error
+    except SafetensorError as error:  # PyTorch goes by the ending
+        raise WeightsError(
+            f"{path}: ends in .safetensors, but is not such a file, or is truncated ({error}); copy it again"
+        ) from error
+
+
+def _read_pickle(path: Path) -> dict[str, Tensor]:
+    state = _load_pickle(path)
+    if _is_training_state(state):
+        raise WeightsError(_about_training_state(path))
     if isinstance(state, dict) and isinstance(state.get("state_dict"), dict):
         state = state["state_dict"]
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()) or not state:

@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import pytest
+
+from trilitenet.config import DEFAULT_ANCHORS, ArtefactInfo, ModelCard, Thresholds, parse
+from trilitenet.errors import ConfigError, WeightsError
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    rate: float = 1.0
+    names: tuple[str, ...] = ("a", "b")
+    thresholds: Thresholds = dataclasses.field(default_factory=Thresholds)
+
+    def __post_init__(self) -> None:
+        if self.rate <= 0:
+            raise ConfigError(f"rate must be above 0, got {self.rate}")
+
+
+def test_what_a_dataclass_refuses_is_told_in_its_own_words() -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse(Settings, {"rate": 0, "names": ["x"]}, "here")
+    assert str(caught.value) == "here: rate must be above 0, got 0.0"
+    with pytest.raises(ConfigError) as caught:
+        parse(Settings, {"thresholds": {"iou": 2, "lane": 0.1}}, "here")
+    assert str(caught.value) == "here: thresholds: iou must be between 0 and 1, got 2.0"
+
+
+def test_a_value_of_the_wrong_type_is_told_with_its_field() -> None:
+    with pytest.raises(ConfigError, match=r"^here: rate: .*number.*, got 'fast'$"):
+        parse(Settings, {"rate": "fast"}, "here")
+
+
+@pytest.mark.parametrize(
+    ("anchors", "message"),
+    [
+        (DEFAULT_ANCHORS[:2], r"3 levels of 3 sizes, got \[3, 3\]"),
+        ((), r"got \[\]"),
+        ((*DEFAULT_ANCHORS[:2], DEFAULT_ANCHORS[2][:2]), r"got \[3, 3, 2\]"),
+        ((*DEFAULT_ANCHORS[:2], ((1.0, 0.0),) * 3), r"above 0 and finite, got 0\.0"),
+        ((*DEFAULT_ANCHORS[:2], ((math.nan, 1.0),) * 3), "got nan"),
+        ((*DEFAULT_ANCHORS[:2], ((1.0, math.inf),) * 3), "got inf"),
+    ],
+)
+def test_unusable_anchors_are_refused(anchors: tuple[tuple[tuple[float, float], ...], ...], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        ModelCard("tiny", anchors=anchors)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({}, "has no schema"),
+        ({"schema": "x"}, "schema must be a whole number, got 'x'"),
+        ({"schema": None}, "schema must be a whole number, got None"),
+        ({"schema": 99}, "schema 99 is newer than 1, which this version reads; upgrade"),
+    ],
+)
+def test_a_schema_is_missing_wrong_or_newer(change: dict[str, object], message: str) -> None:
+    for cls, text in ((ModelCard, ModelCard("tiny").to_json()), (ArtefactInfo, ArtefactInfo("onnx").to_json())):
+        mapping = json.loads(text)
+        del mapping["schema"]
+        with pytest.raises(WeightsError, match=f"^file: .*{message}"):
+            cls.from_json(json.dumps(mapping | change), "file")
