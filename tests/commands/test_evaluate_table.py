@@ -1,13 +1,19 @@
 from __future__ import annotations
 
+import re
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from tests.artefacts import Artefacts
+from trilitenet.commands import evaluate_table as command
 from trilitenet.commands.evaluate_table import PrecisionRow, PrecisionTable, evaluate_table
 from trilitenet.data.synthetic_files import write_dataset
-from trilitenet.errors import ConfigError
+from trilitenet.engine.report import Figure
+from trilitenet.errors import ConfigError, OutputError
 
 
 def test_differences_are_to_the_first_row_of_the_model() -> None:
@@ -33,6 +39,44 @@ def test_options_that_do_not_fit(tmp_path: Path) -> None:
         evaluate_table("tiny", data=tmp_path, output=tmp_path, format="onnx")
     with pytest.raises(ConfigError, match="at least one"):
         evaluate_table("tiny", data=tmp_path, output=tmp_path, precisions=())
+    with pytest.raises(ConfigError, match="--calibration-frames must be at least 1, got 0"):
+        evaluate_table("tiny", data=tmp_path, output=tmp_path, calibration_frames=0)
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match=r"file/precisions\.md: cannot be written \(.*file is no folder\)$"):
+        evaluate_table("tiny", data=tmp_path, output=tmp_path / "file")
+
+
+def test_int8_is_named_by_what_calibrates_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No export and no measuring: the names under which a second run would look for its artefacts."""
+    data = tmp_path / "data"
+    write_dataset(data, "val", 1, 0, size=(64, 128))
+    write_dataset(data, "train", 3, 1, size=(64, 128))
+    for name in ("other", "copy"):
+        shutil.copytree(data, tmp_path / name)
+    picture = next((tmp_path / "other" / "images" / "train").iterdir())
+    picture.write_bytes(picture.read_bytes() + b"another")
+    exported: list[str] = []
+
+    def names(**options: Any) -> list[str]:
+        exported.clear()
+        evaluate_table("tiny", data=data, output=tmp_path, precisions=("fp32", "int8"), **options)
+        return exported.copy()
+
+    report = SimpleNamespace(figures={"fair/lane/iou": Figure(0.5)}, provenance=SimpleNamespace(runtime="x"))
+    monkeypatch.setattr(command, "export", lambda *_, output, **__: exported.append(output.name))
+    monkeypatch.setattr(command, "evaluate", lambda *_, **__: report)
+    first, other = names(), names(calibration=tmp_path / "other")
+    assert first[0] == other[0]
+    assert first[0].endswith("-384x640-fp32.xml")
+    assert re.fullmatch(r"tiny-[0-9a-f]{12}-384x640-int8-500-[0-9a-f]{12}\.xml", first[1])
+    assert first[1] != other[1]
+    assert names(calibration=tmp_path / "copy") == first
+    # The val split decides with --max-drop, and only then.
+    dropped = names(max_drop=1.0)
+    assert dropped[1].endswith("-drop1.xml")
+    next((tmp_path / "copy" / "det_annotations" / "val").iterdir()).unlink()
+    assert names(calibration=tmp_path / "copy") == first
+    assert names(calibration=tmp_path / "copy", max_drop=1.0)[1] != dropped[1]
 
 
 @pytest.mark.slow

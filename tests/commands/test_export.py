@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +11,12 @@ from PIL import Image
 
 import trilitenet
 from tests.artefacts import Artefacts
+from trilitenet.commands import export as command
 from trilitenet.commands.export import export
 from trilitenet.deploy.parity import TOLERANCES, Tolerance
 from trilitenet.errors import BackendError, ConfigError, OutputError
+from trilitenet.models.trilitenet import build_network
+from trilitenet.models.weights import save_network
 
 
 @pytest.fixture
@@ -36,6 +41,12 @@ def test_options_that_do_not_fit(artefacts: Artefacts, tmp_path: Path) -> None:
         ({"format": "ncnn", "precision": "bf16"}, "ncnn artefacts come as fp32, fp16, not bf16"),
         ({"format": "ncnn", "size": "dynamic"}, "ncnn needs a fixed --size"),
         ({"format": "ncnn", "output": tmp_path / "a.param"}, "end with .ncnn.param"),
+        ({"format": "tensorrt", "output": Path()}, "end with .engine"),
+        ({"precision": "int8", "calibration": tmp_path, "calibration_frames": -3}, "must be at least 1, got -3"),
+        ({"portable": True, "masks": "probability"}, "are logits; give --masks logit or leave it out, not probability"),
+        ({"format": "ncnn", "masks": "decision"}, "are logits"),
+        ({"format": "tensorrt", "masks": "decision"}, "are logits"),
+        ({"format": "triton", "portable": True, "masks": "decision"}, "are logits"),
         ({"output": tmp_path / "a.xml"}, "end with .onnx"),
     )
     for options, message in cases:
@@ -44,6 +55,89 @@ def test_options_that_do_not_fit(artefacts: Artefacts, tmp_path: Path) -> None:
     (tmp_path / "a.onnx").touch()
     with pytest.raises(OutputError, match="exists already"):
         export(weights, output=tmp_path / "a.onnx")
+
+
+def test_suppression_needs_boxes(tmp_path: Path) -> None:
+    network = build_network("tiny", tasks=("lane",))
+    save_network(network, tmp_path / "lane.safetensors", network.card)
+    with pytest.raises(ConfigError, match="has no detection task"):
+        export(str(tmp_path / "lane.safetensors"), nms=True, output=tmp_path / "a.onnx")
+
+
+@pytest.mark.parametrize(
+    ("format_", "name", "other"),
+    [
+        ("tensorrt", "a.engine", "a.onnx"),
+        ("openvino", "a.xml", "a.bin"),
+        ("ncnn", "a.ncnn.param", "a.ncnn.bin"),
+        ("ncnn", "a.ncnn.param", "a.ncnn.json"),
+    ],
+)
+def test_no_file_is_replaced_unasked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format_: Any, name: str, other: str
+) -> None:
+    monkeypatch.setattr(command, "is_installed", lambda: False)
+    monkeypatch.setattr(command, "load_network", _no_work)
+    (tmp_path / other).write_text("mine")
+    with pytest.raises(
+        OutputError, match=f"^{tmp_path / other}: exists already; give another --output or --overwrite$"
+    ):
+        export("tiny", format=format_, output=tmp_path / name)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(other, "mine")]
+
+
+@pytest.mark.parametrize(
+    ("format_", "output", "told"),
+    [
+        ("onnx", "file/a.onnx", "file/a.onnx"),
+        ("torch", "file/deep/a.pt2", "file/deep/a.pt2"),
+        ("tensorrt", "file/a.engine", "file/a.onnx"),
+        ("triton", "file", "file/tiny/config.pbtxt"),
+    ],
+)
+def test_a_file_in_the_place_of_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format_: Any, output: str, told: str
+) -> None:
+    monkeypatch.setattr(command, "is_installed", lambda: False)
+    monkeypatch.setattr(command, "load_network", _no_work)
+    (tmp_path / "file").touch()
+    reason = rf"cannot be written \({tmp_path / 'file'} is no folder\)"
+    with pytest.raises(OutputError, match=f"^{tmp_path / told}: {reason}$"):
+        export("tiny", format=format_, output=tmp_path / output)
+
+
+def test_what_cannot_be_written_is_told_in_one_line(
+    artefacts: Artefacts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.onnx").mkdir()
+    with pytest.raises(OutputError, match=r"a\.onnx: cannot be written \(it is a folder\)$"):
+        export("tiny", output=tmp_path / "a.onnx", overwrite=True)
+    # What only shows on writing, such as a full disk.
+    monkeypatch.setattr(command, "build_onnx", lambda *_, **__: None)
+
+    def fill(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(command, "save_onnx", fill)
+    with pytest.raises(OutputError, match=r"b\.onnx: cannot be written \(No space left on device\)$"):
+        export(str(artefacts.folder / "weights.safetensors"), size="64x128", output=tmp_path / "b.onnx")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.onnx"]
+
+
+def _no_work(*_: object) -> Any:
+    raise AssertionError("the work began")
+
+
+def test_masks_are_decisions_or_with_portable_logits_by_default(
+    artefacts: Artefacts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = []
+    monkeypatch.setattr(command, "build_onnx", lambda *_, **__: None)
+    monkeypatch.setattr(command, "_keep", lambda _network, _built, info, *_: kept.append(info.masks))
+    weights = str(artefacts.folder / "weights.safetensors")
+    for options in ({}, {"masks": "probability"}, {"portable": True}, {"portable": True, "masks": "logit"}):
+        export(weights, size="64x128", output=tmp_path / "a.onnx", **options)
+    assert kept == ["decision", "probability", "logit", "logit"]
 
 
 @pytest.mark.slow

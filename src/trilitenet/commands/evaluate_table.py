@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Literal
 
 from trilitenet.commands.evaluate import evaluate, hash_dataset, hash_model
-from trilitenet.commands.export import PRECISIONS, SUFFIXES, Precision, export
+from trilitenet.commands.export import (
+    DROP_FRAMES,
+    PRECISIONS,
+    SUFFIXES,
+    Precision,
+    check_writable,
+    export,
+    find_pictures,
+)
 from trilitenet.commands.tables import markdown_row
 from trilitenet.data.reading import DrivingDataset
+from trilitenet.engine.provenance import hash_files
 from trilitenet.engine.report import Report, read_report
-from trilitenet.errors import ConfigError, OutputError
+from trilitenet.errors import ConfigError, writing
 
 __all__ = ["PrecisionRow", "PrecisionTable", "evaluate_table"]
 
@@ -113,8 +123,8 @@ def evaluate_table(
 ) -> PrecisionTable:
     """Export models in several precisions, measure each by both protocols, and print the paper's table of precisions.
 
-    Artefacts and reports stay in the output folder; what is there of the same model, data and settings is not made
-    again.
+    Artefacts and reports stay in the output folder; what is there of the same model, data, calibration frames and
+    settings is not made again.
 
     Args:
         models: Names of shipped weights, or weight files; tiny, small and base if left out.
@@ -134,7 +144,8 @@ def evaluate_table(
         The table.
 
     Raises:
-        ConfigError: If there is no precision, or the format lacks one.
+        ConfigError: If there is no precision, the format lacks one, or there shall be no calibration frames.
+        OutputError: If the output folder cannot be written to.
     """
     if not precisions:
         raise ConfigError("name at least one of --precisions fp32 fp16 bf16 int8")
@@ -143,14 +154,19 @@ def evaluate_table(
             raise ConfigError(
                 f"{format} artefacts come as {', '.join(PRECISIONS[format])}; leave {precision} out of --precisions"
             )
+    if calibration_frames < 1:
+        raise ConfigError(f"--calibration-frames must be at least 1, got {calibration_frames}")
+    check_writable(output / "precisions.md")
+    int8 = ""
+    if "int8" in precisions:
+        int8 = f"-{calibration_frames}-{_hash_calibration(calibration or data, calibration_frames, max_drop)[:12]}"
+        int8 += "" if max_drop is None else f"-drop{max_drop:g}"
     data_hash = hash_dataset(DrivingDataset(data, split), limit)
     rows: list[PrecisionRow] = []
     for model in models or ("tiny", "small", "base"):
         stamp = (hash_model(model) or "")[:12]
         for precision in precisions:
-            name = f"{Path(model).stem}-{stamp}-{size}-{precision}"
-            if precision == "int8":
-                name += f"-{calibration_frames}" + ("" if max_drop is None else f"-drop{max_drop:g}")
+            name = f"{Path(model).stem}-{stamp}-{size}-{precision}{int8 if precision == 'int8' else ''}"
             artefact = output / f"{name}{SUFFIXES[format]}"
             report = None if overwrite else _done(output / name / "report.json", artefact, data_hash)
             if report is None:
@@ -183,11 +199,18 @@ def evaluate_table(
             figures = {key: figure.value for key, figure in report.figures.items()}
             rows.append(PrecisionRow(model, precision, report.provenance.runtime, figures))
     table = PrecisionTable(tuple(rows))
-    try:
+    with writing(output / "precisions.md"):
         (output / "precisions.md").write_text(table.summary() + "\n", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{output / 'precisions.md'}: cannot be written ({error})") from error
     return table
+
+
+def _hash_calibration(calibration: Path, frames: int, max_drop: float | None) -> str:
+    """Return the SHA-256 of what decides an INT8 artefact: the frames, and the val split that a drop is measured on."""
+    frames_hash = hash_files(find_pictures(calibration, frames, "train"))
+    if max_drop is None:
+        return frames_hash
+    measured = hash_dataset(DrivingDataset(calibration, "val"), DROP_FRAMES)
+    return hashlib.sha256("\n".join((frames_hash, *measured.values())).encode()).hexdigest()
 
 
 def _done(path: Path, artefact: Path, data_hash: dict[str, str]) -> Report | None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ from trilitenet.deploy.quantize import KEEP_STEPS, quantize_onnx, quantize_openv
 from trilitenet.deploy.tensorrt import build_engine, is_installed, trtexec_line
 from trilitenet.deploy.triton import write_triton_repository
 from trilitenet.engine.evaluate import evaluate
-from trilitenet.errors import BackendError, ConfigError, InputError, OutputError
+from trilitenet.errors import BackendError, ConfigError, InputError, OutputError, writing
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.torch_backend import TorchBackend
@@ -37,7 +38,16 @@ from trilitenet.processing.images import read_image
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.structures import RawOutputs
 
-__all__ = ["PRECISIONS", "SUFFIXES", "Exported", "Precision", "export"]
+__all__ = [
+    "DROP_FRAMES",
+    "PRECISIONS",
+    "SUFFIXES",
+    "Exported",
+    "Precision",
+    "check_writable",
+    "export",
+    "find_pictures",
+]
 
 Format = Literal["onnx", "openvino", "ncnn", "tensorrt", "torch", "triton"]
 Precision = Literal["fp32", "fp16", "bf16", "int8"]
@@ -59,6 +69,8 @@ PRECISIONS = {
     "triton": ("fp32", "fp16", "int8"),
 }
 """Precisions of a format."""
+DROP_FRAMES: Final = 150
+"""The drop of INT8 is measured on the first so many images of the val split."""
 _IMAGES = {".bmp", ".jpeg", ".jpg", ".png", ".webp"}
 
 
@@ -100,7 +112,7 @@ def export(
     max_drop: float | None = None,
     nms: bool = False,
     portable: bool = False,
-    masks: Masks = "decision",
+    masks: Masks | None = None,
     mask_scale: int = 1,
     bgr: bool = False,
     layout: str = "auto",
@@ -124,21 +136,22 @@ def export(
         calibration_frames: At most so many of them.
         max_drop: INT8 may lose at most so many points of a score on the val split of --calibration; layers fall back
             to floating point, part by part, until it does.
-        nms: Put non-maximum suppression inside, with the model's thresholds (onnx, openvino).
+        nms: Put non-maximum suppression inside, with the model's thresholds (onnx, openvino, triton).
         portable: Avoid operators that compilers for phones and accelerators refuse; float input, float mask logits.
-        masks: decision (0 or 1, by the model's thresholds), probability (x 255) or logit.
+        masks: decision (0 or 1, by the model's thresholds; the default), probability (x 255) or logit (the only choice,
+            and the default, with --portable, ncnn and tensorrt).
         mask_scale: 2 doubles the size of masks inside the graph.
         bgr: Take BGR pixels (`trilitenet.load` converts by itself).
         layout: auto, or a memory layout by name (docs/speed.md); all compute the same.
         frames: Pictures for the comparison; by default those of --calibration, else synthetic scenes.
-        overwrite: Replace an existing artefact.
+        overwrite: Replace existing files of an artefact.
 
     Returns:
         What was written.
 
     Raises:
         ConfigError: If options do not fit each other.
-        OutputError: If the artefact exists, or cannot be written.
+        OutputError: If a file of the artefact exists (told before the work begins), or cannot be written.
         BackendError: If the comparison fails.
     """
     if precision not in PRECISIONS[format]:
@@ -147,6 +160,8 @@ def export(
         raise ConfigError("--nms is for onnx, openvino and triton")
     if precision == "int8" and calibration is None:
         raise ConfigError("int8 needs --calibration: a data set in the published layout, or a folder of road frames")
+    if calibration_frames < 1:
+        raise ConfigError(f"--calibration-frames must be at least 1, got {calibration_frames}")
     if max_drop is not None and precision != "int8":
         raise ConfigError("--max-drop is for --precision int8")
     if format in ("ncnn", "tensorrt"):
@@ -156,13 +171,21 @@ def export(
         raise ConfigError("int8 needs a fixed --size")
     if format == "ncnn" and parsed is None:
         raise ConfigError("ncnn needs a fixed --size")
-    if portable:
-        masks = "logit"
-    network = load_network(model).eval()
+    if portable and masks not in (None, "logit"):
+        raise ConfigError(
+            f"masks of ncnn, tensorrt and --portable are logits; give --masks logit or leave it out, not {masks}"
+        )
     if format == "triton":
-        repository = output or Path("model_repository")
-        if (repository / Path(model).stem).exists() and not overwrite:
-            raise OutputError(f"{repository / Path(model).stem}: exists already; give another --output or --overwrite")
+        path = (output or Path("model_repository")) / Path(model).stem
+    else:
+        path = output or Path(f"{Path(model).stem}{SUFFIXES[format]}")
+        if not path.name.endswith(SUFFIXES[format]) and not (format == "tensorrt" and path.name):
+            raise ConfigError(f"{format} artefacts end with {SUFFIXES[format]}, not {path.suffix or 'nothing'}")
+    _check_files(path, format, overwrite)
+    network = load_network(model).eval()
+    if nms and "detection" not in network.tasks:
+        raise ConfigError(f"{model} has no detection task, so there are no boxes to suppress; leave --nms out")
+    if format == "triton":
         with tempfile.TemporaryDirectory() as folder:
             exported = export(
                 model,
@@ -181,17 +204,12 @@ def export(
                 layout=layout,
                 frames=frames,
             )
-            path = write_triton_repository(
-                exported.path, repository, network.card, name=Path(model).stem, overwrite=overwrite
-            )
-        serve = f"Serve it with: tritonserver --model-repository {repository.resolve()}"
+            with writing(path):
+                write_triton_repository(exported.path, path.parent, network.card, name=path.name, overwrite=overwrite)
+        serve = f"Serve it with: tritonserver --model-repository {path.parent.resolve()}"
         return dataclasses.replace(exported, path=path, notes=(*exported.notes, serve))
-    path = output or Path(f"{Path(model).stem}{SUFFIXES[format]}")
-    if not path.name.endswith(SUFFIXES[format]) and format != "tensorrt":
-        raise ConfigError(f"{format} artefacts end with {SUFFIXES[format]}, not {path.suffix or 'nothing'}")
-    if path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists already; give another --output or --overwrite")
 
+    masks = masks or ("logit" if portable else "decision")
     info = ArtefactInfo(
         format=format,
         precision=precision,
@@ -244,6 +262,45 @@ def export(
     raise BackendError(f"{path}: not written, INT8 costs too much even with most layers in floating point ({reason})")
 
 
+def check_writable(path: Path) -> None:
+    """Refuse, before any work, a file whose place is taken by a folder, or that no folder can be made for.
+
+    Raises:
+        OutputError: If it is so.
+    """
+    with writing(path):
+        folder = next((parent for parent in path.parents if parent.exists()), Path())
+        reason = ""
+        if not folder.is_dir():
+            reason = f"{folder} is no folder"
+        elif path.is_dir():
+            reason = "it is a folder"
+        elif not os.access(folder, os.W_OK | os.X_OK):
+            reason = f"no permission to write in {folder}"
+    if reason:
+        raise OutputError(f"{path}: cannot be written ({reason})")
+
+
+def _check_files(path: Path, format: Format, overwrite: bool) -> None:
+    """Refuse, before any work, files that exist already and those that cannot be written."""
+    files = [path]
+    if format == "openvino":
+        files = [path, path.with_suffix(".bin")]
+    elif format == "ncnn":
+        files = [path, path.with_suffix(".bin"), path.with_suffix(".json")]
+    elif format == "tensorrt" and not is_installed():
+        files = [_fallback(path)]
+    elif format == "triton":
+        files = [path / "config.pbtxt", path / "1" / "model.onnx"]
+    for file in (path, *files):
+        with writing(file):
+            exists = file.exists()
+        if exists and not overwrite:
+            raise OutputError(f"{file}: exists already; give another --output or --overwrite")
+    for file in files:
+        check_writable(file)
+
+
 def _parse_size(size: str) -> tuple[int, int] | None:
     """Return (height, width), None for dynamic."""
     if size == "dynamic":
@@ -265,13 +322,22 @@ def _canvases(source: Path | None, canvas: tuple[int, int], count: int, split: s
         scenes = SyntheticScenes(seed=0, size=canvas)
         images = [scenes[index].image for index in range(min(count, 4))]
     else:
-        folder = source / "images" / split if (source / "images" / split).is_dir() else source
-        names = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _IMAGES)
-        if not names:
-            raise InputError(f"{source}: no pictures there")
-        chosen = np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int)
-        images = [read_image(names[index]) for index in chosen]
+        images = [read_image(path) for path in find_pictures(source, count, split)]
     return [Letterbox.fit(image.shape[:2], canvas=canvas).image(image) for image in images]
+
+
+def find_pictures(source: Path, count: int, split: str) -> list[Path]:
+    """Return at most ``count`` pictures of a data set's split, or of a folder, spread evenly over what there is.
+
+    Raises:
+        InputError: If there are none.
+    """
+    folder = source / "images" / split if (source / "images" / split).is_dir() else source
+    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _IMAGES)
+    if not paths:
+        raise InputError(f"{source}: no pictures there")
+    chosen = np.linspace(0, len(paths) - 1, min(count, len(paths))).round().astype(int)
+    return [paths[index] for index in chosen]
 
 
 def _as_input(canvas: NDArray[np.uint8], info: ArtefactInfo) -> NDArray[Any]:
@@ -294,15 +360,22 @@ def _keep(
     network: TriLiteNet, built: Any, info: ArtefactInfo, path: Path, checks: Sequence[NDArray[np.uint8]]
 ) -> Exported:
     """Write beside the destination, compare, and only then move into place."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
-        trial = Path(folder) / path.name
+    with _trial(path) as trial:
         _write(built, trial, network, info)
         parity = _compare(network, _open(trial, info), info, checks)
         _require(parity, path)
-        for part in Path(folder).iterdir():
-            part.replace(path.parent / part.name)
     return Exported(path, info, parity)
+
+
+@contextlib.contextmanager
+def _trial(path: Path) -> Iterator[Path]:
+    """Yield a name beside the destination; what is written there is moved into place if nothing is raised."""
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
+            yield Path(folder) / path.name
+            for part in Path(folder).iterdir():
+                part.replace(path.parent / part.name)
 
 
 def _open(path: Path, info: ArtefactInfo) -> Backend:
@@ -365,7 +438,7 @@ def _require(parity: Parity, path: Path) -> None:
         raise BackendError(f"{path}: not written, it differs from the network: {'; '.join(parity.failures)}")
 
 
-def _measure_drop(network: TriLiteNet, artefact: Path, data: Path, limit: int = 150) -> float:
+def _measure_drop(network: TriLiteNet, artefact: Path, data: Path) -> float:
     """Return the largest loss of a score in points on the val split, against the float32 network."""
     from trilitenet.commands.load import load
 
@@ -374,7 +447,7 @@ def _measure_drop(network: TriLiteNet, artefact: Path, data: Path, limit: int = 
     dataset = DrivingDataset(data, "val", class_names=network.card.class_names)
 
     def scores(predictor: Predictor) -> dict[str, float]:
-        report = evaluate(predictor, dataset, limit=limit, resamples=0, worst=0, by=())
+        report = evaluate(predictor, dataset, limit=DROP_FRAMES, resamples=0, worst=0, by=())
         main = ("fair/detection/map50", "fair/drivable/miou", "fair/lane/iou")
         return {key: figure.value for key, figure in report.figures.items() if key in main}
 
@@ -406,14 +479,11 @@ def _export_torch(
         dynamic = ({axis: rows, axis + 1: columns},)
     with torch.no_grad():
         program = torch.export.export(Outputs().eval(), (image,), dynamic_shapes=dynamic)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
-        trial = Path(folder) / path.name
+    with _trial(path) as trial:
         metadata = {CARD_KEY: network.card.to_json(), ARTEFACT_KEY: info.to_json()}
         torch.export.save(program, trial, extra_files=metadata)
         parity = _compare(network, ExportedTorchBackend(trial, "cpu"), info, checks)
         _require(parity, path)
-        os.replace(trial, path)  # noqa: PTH105
     return Exported(path, info, parity)
 
 
@@ -424,15 +494,12 @@ def _export_tensorrt(
     if is_installed():  # pragma: no cover - needs a GPU and TensorRT
         from trilitenet.inference.tensorrt_backend import TensorRTBackend, pack_engine
 
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-            trial = Path(folder) / path.name
+        with _trial(path) as trial:
             trial.write_bytes(pack_engine(build_engine(proto, info.precision), network.card, info))
             parity = _compare(network, TensorRTBackend(trial), info, checks)
             _require(parity, path)
-            os.replace(trial, path)  # noqa: PTH105
         return Exported(path, info, parity)
-    onnx_path = path.with_suffix(".onnx")
+    onnx_path = _fallback(path)
     exported = _keep(network, proto, dataclasses.replace(info, format="onnx", precision="fp32"), onnx_path, checks)
     notes = (
         "TensorRT is not installed here: no engine was built, and none was run.",
@@ -440,3 +507,8 @@ def _export_tensorrt(
         f"  {trtexec_line(onnx_path, path.with_suffix('.plan'), info.precision)}",
     )
     return dataclasses.replace(exported, notes=notes)
+
+
+def _fallback(engine: Path) -> Path:
+    """Return where the graph goes that an engine is built from elsewhere."""
+    return engine.with_suffix(".onnx")
