@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import dataclasses
 import errno
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +15,16 @@ import trilitenet
 from tests.artefacts import Artefacts
 from trilitenet.commands import export as command
 from trilitenet.commands.export import export
+from trilitenet.config import TASKS
+from trilitenet.data.synthetic_files import write_dataset
 from trilitenet.deploy.parity import TOLERANCES, Tolerance
+from trilitenet.engine.evaluate import evaluate
+from trilitenet.engine.figures import FIGURES
+from trilitenet.engine.report import Figure, Report
 from trilitenet.errors import BackendError, ConfigError, OutputError
+from trilitenet.inference.predictor import Predictor
 from trilitenet.models.trilitenet import build_network
-from trilitenet.models.weights import save_network
+from trilitenet.models.weights import load_network, save_network
 
 
 @pytest.fixture
@@ -220,3 +228,29 @@ def test_int8(
     text = path.read_bytes()
     assert (b"FakeQuantize" if format_ == "openvino" else b"QuantizeLinear") in text
     assert "in floating point: difference, detection, c4, c5" in done.summary()
+
+
+def test_the_drop_is_that_of_the_worst_of_all_tasks(
+    artefacts: Artefacts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every task's score is looked at, detection's too, under a name that reports have."""
+    assert set(command.DROP_SCORES) == set(TASKS)
+    assert set(command.DROP_SCORES.values()) <= set(FIGURES)
+    write_dataset(tmp_path / "data", "val", 2, 0, size=(96, 160))
+    network = load_network(artefacts.folder / "weights.safetensors")
+    losses = iter([0.0, 0.02])
+
+    def worse(predictor: Predictor, *arguments: Any, **options: Any) -> Report:
+        report = evaluate(predictor, *arguments, **options)
+        figures = {key: Figure(0.5, None, None) for key in report.figures}
+        figures["fair/detection/ap50"] = Figure(0.5 - next(losses), None, None)
+        return dataclasses.replace(report, figures=figures)
+
+    monkeypatch.setattr(command, "evaluate", worse)
+    path = export(str(artefacts.folder / "weights.safetensors"), output=tmp_path / "a.onnx", size="96x160").path
+    assert command._measure_drop(network, path, tmp_path / "data") == pytest.approx(2.0)
+    monkeypatch.undo()
+    for labels in ("det_annotations", "da_seg_annotations", "ll_seg_annotations"):
+        shutil.rmtree(tmp_path / "data" / labels)
+    with pytest.raises(ConfigError, match="--max-drop needs labels"):
+        command._measure_drop(network, path, tmp_path / "data")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import os
 import re
 import tempfile
@@ -16,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 import trilitenet
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY, MAX_STRIDE, ArtefactInfo
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, MAX_STRIDE, ArtefactInfo, Task
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.deploy.graph import DeployGraph, Masks
 from trilitenet.deploy.layouts import pick_layout
@@ -71,6 +72,12 @@ PRECISIONS = {
 """Precisions of a format."""
 DROP_FRAMES: Final = 150
 """The drop of INT8 is measured on the first so many images of the val split."""
+DROP_SCORES: Final[dict[Task, str]] = {
+    "detection": "fair/detection/ap50",
+    "drivable": "fair/drivable/miou",
+    "lane": "fair/lane/iou",
+}
+"""Of which the largest drop counts."""
 _IMAGES = {".bmp", ".jpeg", ".jpg", ".png", ".webp"}
 
 
@@ -448,13 +455,19 @@ def _measure_drop(network: TriLiteNet, artefact: Path, data: Path) -> float:
 
     def scores(predictor: Predictor) -> dict[str, float]:
         report = evaluate(predictor, dataset, limit=DROP_FRAMES, resamples=0, worst=0, by=())
-        main = ("fair/detection/map50", "fair/drivable/miou", "fair/lane/iou")
-        return {key: figure.value for key, figure in report.figures.items() if key in main}
+        values = {
+            key: report.figures[key].value
+            for task in network.card.tasks
+            if (key := DROP_SCORES[task]) in report.figures
+        }
+        return {key: value for key, value in values.items() if math.isfinite(value)}
 
     before = scores(Predictor(TorchBackend(network, "cpu")))
+    if not before:
+        raise ConfigError(f"--max-drop needs labels; there are none for {', '.join(network.card.tasks)} in {data}")
     with load(artefact) as predictor:
         after = scores(predictor)
-    return max((100 * (value - after[key]) for key, value in before.items()), default=0.0)
+    return max(100 * (value - after.get(key, 0.0)) for key, value in before.items())
 
 
 def _export_torch(
