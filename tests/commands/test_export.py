@@ -239,8 +239,10 @@ def test_the_drop_is_that_of_the_worst_of_all_tasks(
     write_dataset(tmp_path / "data", "val", 2, 0, size=(96, 160))
     network = load_network(artefacts.folder / "weights.safetensors")
     losses = iter([0.0, 0.02])
+    canvases = []
 
     def worse(predictor: Predictor, *arguments: Any, **options: Any) -> Report:
+        canvases.append(predictor.backend.canvas)
         report = evaluate(predictor, *arguments, **options)
         figures = {key: Figure(0.5, None, None) for key in report.figures}
         figures["fair/detection/ap50"] = Figure(0.5 - next(losses), None, None)
@@ -249,6 +251,7 @@ def test_the_drop_is_that_of_the_worst_of_all_tasks(
     monkeypatch.setattr(command, "evaluate", worse)
     path = export(str(artefacts.folder / "weights.safetensors"), output=tmp_path / "a.onnx", size="96x160").path
     assert command._measure_drop(network, path, tmp_path / "data") == pytest.approx(2.0)
+    assert canvases == [(96, 160), (96, 160)]
     monkeypatch.undo()
     for labels in ("det_annotations", "da_seg_annotations", "ll_seg_annotations"):
         shutil.rmtree(tmp_path / "data" / labels)

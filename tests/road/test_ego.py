@@ -6,9 +6,9 @@ import pytest
 
 from trilitenet.processing.geometry import Camera
 from trilitenet.road.camera import CameraErrors
-from trilitenet.road.ego import BOX_ERROR_SHARE, find_distances, fit_ego_lane
+from trilitenet.road.ego import BOX_ERROR_SHARE, LaneFilter, LaneFit, find_distances, fit_ego_lane
 from trilitenet.road.lanes import find_lines
-from trilitenet.road.structures import LaneLine
+from trilitenet.road.structures import EgoLane, Estimate, LaneLine
 from trilitenet.structures import Boxes
 
 CAMERA = Camera.from_field_of_view((720, 1280), 60.0, 1.4, pitch=0.03)
@@ -53,3 +53,130 @@ def test_the_lower_edge_of_a_large_box_is_less_sure() -> None:
     assert errors == sorted(errors)
     # 20 m away, a pixel is 20^2 / (1.4 f) metres.
     assert errors[2] == pytest.approx(BOX_ERROR_SHARE * sides[2] * 20**2 / 1.4 / CAMERA.fy, rel=0.15)
+
+
+def fit_of(offset: float, heading: float = 0.0, curvature: float = 0.0, sure: float = 1.0) -> LaneFit:
+    """Return a lane 3.6 m wide as one frame may tell it."""
+    lane = EgoLane(Estimate(3.6, 0.05), None, None, None)
+    spread = np.diag([0.1**2, 0.02**2, 0.002**2]) / sure**2
+    return LaneFit(lane, None, 1.8, np.array([offset, heading, curvature]), spread, np.array([0.01, 0.001, 0.0]))
+
+
+def offset_of(lane: EgoLane) -> Estimate:
+    assert lane.offset is not None
+    return lane.offset
+
+
+def test_frames_together_tell_the_lane_better_than_one() -> None:
+    rng = np.random.default_rng(0)
+    lanes, followed, alone = LaneFilter(), [], []
+    for frame in range(100):
+        true = 0.2 * np.sin(frame * 0.2)  # five frames a second, one swing in six seconds
+        missed = rng.normal(0.0, 0.1)
+        lane = lanes.update(fit_of(true + missed), frame * 0.2)
+        alone.append(abs(missed))
+        followed.append(abs(offset_of(lane).value - true))
+        assert followed[-1] < 4 * offset_of(lane).error
+    assert np.mean(followed[5:]) < 0.75 * np.mean(alone[5:])
+    assert offset_of(lane).error < 0.1
+    assert lane.width == Estimate(3.6, 0.05)
+
+
+def test_more_frames_a_second_are_not_taken_for_more_evidence() -> None:
+    errors = []
+    for rate in (5, 50):
+        lanes = LaneFilter()
+        for frame in range(10 * rate):
+            lane = lanes.update(fit_of(0.1), frame / rate)
+        errors.append(offset_of(lane).error)
+    assert errors[1] > 0.6 * errors[0]
+
+
+def test_errors_that_hang_together_are_told_apart() -> None:
+    """Once the bend is known, a frame whose offset and bend err together no longer misleads."""
+    lanes = LaneFilter()
+    for frame in range(20):
+        lanes.update(fit_of(0.0, sure=5.0), frame * 0.2)
+    wrong = fit_of(0.3, 0.0, 0.006)
+    spread = wrong.spread.copy()
+    spread[0, 2] = spread[2, 0] = 0.99 * np.sqrt(spread[0, 0] * spread[2, 2])
+    together = offset_of(lanes.update(wrong._replace(spread=spread), 4.0))
+    assert abs(together.value) < 0.02
+
+
+def test_the_next_lane_is_a_step_not_a_slope() -> None:
+    lanes, seen = LaneFilter(), []
+    for frame in range(60):
+        true = frame * 0.05  # a metre a second to the left
+        within = (true + 1.8) % 3.6 - 1.8
+        seen.append((offset_of(lanes.update(fit_of(within), frame * 0.05)).value, within))
+    assert max(abs(value - true) for value, true in seen[20:]) < 0.1
+
+
+def test_one_wild_frame_is_doubted_two_that_agree_are_believed() -> None:
+    lanes = LaneFilter()
+    for frame in range(20):
+        lanes.update(fit_of(0.0), frame * 0.2)
+    assert lanes.update(fit_of(1.2, sure=3.0), 4.0).offset is None, "its error is as large as the contradiction"
+    assert offset_of(lanes.update(fit_of(0.0), 4.2)).value == pytest.approx(0.0, abs=0.25)
+    assert lanes.update(fit_of(1.2, sure=3.0), 4.4).offset is None
+    assert offset_of(lanes.update(fit_of(1.3, sure=3.0), 4.6)).value == pytest.approx(1.3, abs=0.05)
+
+
+def test_one_stray_line_does_not_move_the_vehicle_into_the_next_lane() -> None:
+    lanes = LaneFilter()
+    for frame in range(50):
+        lanes.update(fit_of(-1.0, sure=3.0), frame * 0.04)
+    for frame, stray in ((50, fit_of(0.1, sure=3.0)._replace(half_width=1.0)), (51, fit_of(1.9, sure=3.0))):
+        assert lanes.update(stray, frame * 0.04).offset is None
+        for after in range(1, 5):
+            lane = lanes.update(fit_of(-1.0, sure=3.0), (frame + 0.2 * after) * 0.04)
+        assert offset_of(lane).value == pytest.approx(-1.0, abs=0.2)
+
+
+def test_the_same_moment_again_changes_nothing() -> None:
+    lanes = LaneFilter()
+    for frame in range(20):
+        lane = lanes.update(fit_of(0.5), frame * 0.2)
+    assert lanes.update(fit_of(1.0), 19 * 0.2).offset == lane.offset
+
+
+def test_what_one_frame_alone_errs_by_is_not_kept() -> None:
+    """A frame in which the car pitches is marked by its errors, and leaves no trace in later ones."""
+    left, right = line_at(1.8), line_at(-1.8)
+    bump = CameraErrors(pitch=0.05)
+    fit = fit_ego_lane(left, right, CAMERA, bump, usual=CameraErrors())
+    plain = fit_ego_lane(left, right, CAMERA, CameraErrors())
+    assert fit is not None
+    assert plain is not None
+    np.testing.assert_allclose(fit.lasting, plain.lasting)
+    assert fit.spread[0, 0] > plain.spread[0, 0] + 0.02
+    lanes = LaneFilter()
+    for frame in range(10):
+        lanes.update(plain, frame * 0.04)
+    wrong = fit._replace(seen=fit.seen + np.array([0.2, 0.0, 0.0]))
+    for frame in range(10, 15):
+        lanes.update(wrong, frame * 0.04)
+    lane = lanes.update(plain, 15 * 0.04)
+    assert abs(offset_of(lane).value) < 2 * offset_of(lane).error
+
+
+def test_figures_that_are_none_are_not_taken_in() -> None:
+    lanes = LaneFilter()
+    lanes.update(fit_of(0.1), 0.0)
+    lanes.update(fit_of(float("nan")), 0.2)
+    assert offset_of(lanes.update(fit_of(0.1), 0.4)).value == pytest.approx(0.1)
+
+
+def test_a_lane_out_of_sight_for_long_is_forgotten() -> None:
+    lanes = LaneFilter()
+    for frame in range(20):
+        lanes.update(fit_of(0.0), frame * 0.2)
+    assert offset_of(lanes.update(fit_of(0.5), 3.8 + LaneFilter.GAP + 0.1)).value == pytest.approx(0.5)
+
+
+def test_a_frame_outside_of_its_lane_is_passed_on_as_it_is() -> None:
+    lanes = LaneFilter()
+    lanes.update(fit_of(0.0), 0.0)
+    outside = fit_of(2.5)._replace(seen=None)
+    assert lanes.update(outside, 0.2) is outside.lane

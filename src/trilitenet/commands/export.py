@@ -462,10 +462,10 @@ def _measure_drop(network: TriLiteNet, artefact: Path, data: Path) -> float:
         }
         return {key: value for key, value in values.items() if math.isfinite(value)}
 
-    before = scores(Predictor(TorchBackend(network, "cpu")))
-    if not before:
-        raise ConfigError(f"--max-drop needs labels; there are none for {', '.join(network.card.tasks)} in {data}")
     with load(artefact) as predictor:
+        before = scores(Predictor(TorchBackend(network, "cpu", predictor.backend.canvas)))  # the same pixels for both
+        if not before:
+            raise ConfigError(f"--max-drop needs labels; there are none for {', '.join(network.card.tasks)} in {data}")
         after = scores(predictor)
     return max(100 * (value - after.get(key, 0.0)) for key, value in before.items())
 

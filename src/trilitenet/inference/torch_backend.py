@@ -44,12 +44,14 @@ class TorchBackend:
     Args:
         network: The network; it is moved to the device and put in evaluation mode.
         device: As `pick_device` takes it.
+        canvas: Fix the input to this (height, width), as artefacts do; None takes any size in multiples of 32.
 
     Raises:
         BackendError: If the device cannot be used.
     """
 
-    def __init__(self, network: TriLiteNet, device: str = "auto") -> None:
+    def __init__(self, network: TriLiteNet, device: str = "auto", canvas: tuple[int, int] | None = None) -> None:
+        self._canvas = canvas
         self.device = pick_device(device)
         self.network: TriLiteNet = network.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
@@ -65,8 +67,8 @@ class TorchBackend:
 
     @property
     def canvas(self) -> tuple[int, int] | None:
-        """None: any size in multiples of 32 will do."""
-        return None
+        """(height, width) of the input if it is fixed."""
+        return self._canvas
 
     def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
         """Run the network on (B, H, W, 3) uint8 RGB; see `Backend.run`."""

@@ -21,6 +21,7 @@ from trilitenet.structures import Boxes
 __all__ = [
     "REACH",
     "REAR_OVERHANG",
+    "LaneFilter",
     "LaneFit",
     "LeadFilter",
     "find_distances",
@@ -47,6 +48,8 @@ IN_LANE: Final = 0.7
 """A vehicle is in the ego lane when its middle is within so much of half the lane's width."""
 MAX_OUTSIDE: Final = 0.2
 """The vehicle's middle is at most so many metres outside of the lines of its own lane, as they are measured."""
+UNSEEN: Final = 1e4
+"""Variance of a figure that a frame does not tell."""
 MAX_OFFSET_ERROR: Final = 0.4
 MAX_HEADING_ERROR: Final = 0.04
 MAX_CURVATURE_ERROR: Final = 0.006
@@ -61,11 +64,18 @@ class LaneFit(NamedTuple):
         lane: What there is to say of it.
         centre: Its middle; None where only one line was seen and the width is not known.
         half_width: Metres.
+        seen: (3,) offset, heading and curvature as fitted, however sure; None where the vehicle would be outside of
+            the lane.
+        spread: (3, 3) covariance of their errors that differ from frame to frame; what was not seen has a huge one.
+        lasting: (3,) standard deviations of their errors that last (the camera's).
     """
 
     lane: EgoLane
     centre: GroundCurve | None
     half_width: float
+    seen: Floats | None
+    spread: Floats
+    lasting: Floats
 
 
 class _Points(NamedTuple):
@@ -111,6 +121,7 @@ def fit_ego_lane(
     camera: Camera,
     errors: CameraErrors,
     *,
+    usual: CameraErrors | None = None,
     known_width: Estimate | None = None,
 ) -> LaneFit | None:
     """Fit the two lines of the ego lane as one curve with two distances from it.
@@ -119,7 +130,8 @@ def fit_ego_lane(
         left: The line left of the vehicle.
         right: The line right of it.
         camera: The camera.
-        errors: How well it is known.
+        errors: How well it is known in this frame.
+        usual: How well it is known in general, if that is better: what is beyond differs from frame to frame.
         known_width: Width of the lane from earlier frames, for when one line is out of sight.
 
     Returns:
@@ -158,9 +170,6 @@ def fit_ego_lane(
     cos = 1 / math.sqrt(1 + slope * slope)
     variance = np.diag(covariance)
 
-    def kept(value: float, error: float, limit: float) -> Estimate | None:
-        return Estimate(value, error) if math.isfinite(error) and error <= limit else None
-
     side_error = math.sqrt(float(np.mean(variance[:count])))
     width: Estimate | None = None
     middle: float | None = None
@@ -177,28 +186,168 @@ def fit_ego_lane(
         half = known_width.value / 2
         shift = half / cos if usable[0][0] == "right" else -half / cos
         middle, middle_error = float(solution[0]) + shift, math.hypot(side_error, known_width.error)
-    offset = None
-    if middle is not None:
-        value = -middle * cos
-        tilt = (errors.yaw + errors.pitch) * float(x.min())
-        error = math.sqrt(middle_error**2 + (value * errors.height) ** 2 + tilt**2)
-        if abs(value) < half + MAX_OUTSIDE:  # else these are not the lines of the lane that the vehicle is in
-            offset = kept(value, error, MAX_OFFSET_ERROR)
-    heading = kept(
-        -math.atan(slope),
-        math.sqrt(float(variance[count]) + errors.yaw**2 + (errors.pitch * (middle or 0.0) / camera.height) ** 2),
-        MAX_HEADING_ERROR,
+    seen = np.array([-(middle or 0.0) * cos, -math.atan(slope), bend * cos**3])
+    of_camera = _camera_shares(seen, errors, camera, float(x.min()))
+    lasting = of_camera if usual is None else np.minimum(of_camera, _camera_shares(seen, usual, camera, float(x.min())))
+    offset = curvature = None
+    inside = middle is None or abs(float(seen[0])) < half + MAX_OUTSIDE
+    if middle is not None and inside:  # else these are not the lines of the lane that the vehicle is in
+        offset = _kept(float(seen[0]), math.hypot(middle_error, float(of_camera[0])), MAX_OFFSET_ERROR)
+    heading = _kept(
+        float(seen[1]), math.hypot(math.sqrt(float(variance[count])), float(of_camera[1])), MAX_HEADING_ERROR
     )
-    curvature = None
     if degree >= 2:
-        value = bend * cos**3
-        error = math.hypot(2 * math.sqrt(float(variance[count + 1])), abs(value) * (errors.focal + errors.height))
-        curvature = kept(value, error, MAX_CURVATURE_ERROR)
+        error = math.hypot(2 * math.sqrt(float(variance[count + 1])), float(of_camera[2]))
+        curvature = _kept(float(seen[2]), error, MAX_CURVATURE_ERROR)
+    turned = np.zeros((3, count + degree))  # from the unknowns to offset, heading and curvature
+    turned[0, :count] = -1 / count
+    turned[1, count] = -1.0
+    if degree >= 2:
+        turned[2, count + 1] = 4.0  # twice the coefficient, and the error doubled as above
+    spread = turned @ covariance @ turned.T + np.diag(of_camera**2 - lasting**2)
+    if middle is None:
+        spread[0, 0] += UNSEEN
+    elif count == 1:
+        spread[0, 0] += middle_error**2 - side_error**2
+    if degree < 2:
+        spread[2, 2] += UNSEEN
     centre = None
     if middle is not None:
         polynomial = np.array([middle, slope, bend / 2, change / 6])
         centre = GroundCurve(polynomial, float(x.min()), float(x.max()))
-    return LaneFit(EgoLane(width, offset, heading, curvature), centre, half)
+    return LaneFit(EgoLane(width, offset, heading, curvature), centre, half, seen if inside else None, spread, lasting)
+
+
+def _camera_shares(seen: Floats, errors: CameraErrors, camera: Camera, near: float) -> Floats:
+    """Return the standard deviations of offset, heading and curvature that the camera's errors make."""
+    offset, _, curvature = seen.tolist()
+    return np.array(
+        [
+            math.hypot(offset * errors.height, (errors.yaw + errors.pitch) * near),
+            math.hypot(errors.yaw, errors.pitch * offset / camera.height),
+            abs(curvature) * (errors.focal + errors.height),
+        ]
+    )
+
+
+def _kept(value: float, error: float, limit: float) -> Estimate | None:
+    return Estimate(value, error) if math.isfinite(value) and error <= limit else None
+
+
+_SEEN: Final = [0, 2, 4]
+"""Where offset, heading and curvature stand in the state of a `LaneFilter`."""
+
+
+class LaneFilter:
+    """Follows offset, heading and curvature over time.
+
+    It is a Kalman filter of the three together, with the rates of offset and heading: the fit knows how their errors in
+    one frame hang together, so that what earlier frames told of the bend makes the offset surer. A frame that
+    contradicts the others counts less, and what it is off by goes into the errors told; two such frames that agree are
+    believed.
+    """
+
+    SWERVE: Final = 0.3
+    """How much the rate of the offset wanders in a second, in m/s."""
+    TURN: Final = 0.025
+    """How much the rate of the heading wanders in a second, in rad/s."""
+    BEND: Final = 0.002
+    """How far the curvature wanders in a second, in 1/m."""
+    ALIKE: Final = 0.4
+    """Seconds within which the errors of frames are the same, not new ones."""
+    GATE: Final = 16.0
+    """Squared Mahalanobis distance beyond which a frame contradicts the others."""
+    MAX_RATE: Final = 1.0
+    """Standard deviation of the rate of the offset before any is known, in m/s."""
+    GAP: Final = 2.0
+    """Seconds without a lane after which it is forgotten; video with fewer frames is not followed."""
+
+    def __init__(self) -> None:
+        self._state: Floats | None = None
+        self._covariance = np.zeros((5, 5))
+        self._wild: tuple[Floats, Floats] | None = None
+        self._last = 0.0
+
+    def update(self, fit: LaneFit, timestamp: float) -> EgoLane:
+        """Return the lane with what its history tells.
+
+        Args:
+            fit: The lane of this frame.
+            timestamp: Seconds.
+        """
+        if fit.seen is None or not np.isfinite(fit.seen).all():
+            return fit.lane
+        step = timestamp - self._last
+        off = np.zeros(3)
+        if self._state is None or not 0 <= step <= self.GAP:
+            self._start(fit)
+        elif step > 0:  # else it is the same moment again
+            self._advance(step)
+            off = self._take_in(fit, step)
+        self._last = timestamp
+        assert self._state is not None
+        values = self._state[_SEEN]
+        errors = np.sqrt(np.diag(self._covariance)[_SEEN] + fit.lasting**2 + off**2)
+        limits = (MAX_OFFSET_ERROR, MAX_HEADING_ERROR, MAX_CURVATURE_ERROR)
+        offset, heading, curvature = map(_kept, values.tolist(), errors.tolist(), limits)
+        if offset is not None and fit.half_width > 0 and abs(offset.value) > fit.half_width + MAX_OUTSIDE:
+            offset = None
+        return EgoLane(fit.lane.width, offset, heading, curvature)
+
+    def _start(self, fit: LaneFit) -> None:
+        """Begin anew with what one frame tells."""
+        assert fit.seen is not None
+        self._state = np.array([fit.seen[0], 0.0, fit.seen[1], 0.0, fit.seen[2]])
+        self._covariance = np.zeros((5, 5))
+        self._covariance[np.ix_(_SEEN, _SEEN)] = fit.spread
+        self._covariance[1, 1], self._covariance[3, 3] = self.MAX_RATE**2, 0.05**2
+        self._wild = None
+
+    def _advance(self, step: float) -> None:
+        assert self._state is not None
+        move = np.eye(5)
+        move[0, 1] = move[2, 3] = step
+        noise = np.zeros((5, 5))
+        pushed = np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])  # by white noise
+        noise[:2, :2] = pushed * self.SWERVE**2
+        noise[2:4, 2:4] = pushed * self.TURN**2
+        noise[4, 4] = self.BEND**2 * step
+        self._state = move @ self._state
+        self._covariance = move @ self._covariance @ move.T + noise
+
+    def _take_in(self, fit: LaneFit, step: float) -> Floats:
+        """Correct the state by a frame; return by how much a frame that contradicts it is still off."""
+        assert self._state is not None
+        assert fit.seen is not None
+        spread = fit.spread * max(1.0, self.ALIKE / step)
+        total = self._covariance[np.ix_(_SEEN, _SEEN)] + spread
+        apart = fit.seen - self._state[_SEEN]
+        distance = _squared(apart, total)
+        for across in (-2 * fit.half_width, 2 * fit.half_width):
+            # Into the next lane, if that is what fits: one stray line must not do it.
+            if distance > self.GATE and abs(self._state[0] + across) < fit.half_width + MAX_OUTSIDE:
+                rest = apart - np.array([across, 0.0, 0.0])
+                if _squared(rest, total) <= self.GATE:
+                    self._state[0] += across
+                    apart, distance = rest, _squared(rest, total)
+        wild, self._wild = self._wild, None
+        if distance > self.GATE:
+            moved = np.diag(np.square([self.MAX_RATE * step, 0.05 * step, 0.0]))
+            if wild is not None and _squared(fit.seen - wild[0], fit.spread + wild[1] + moved) <= self.GATE:
+                self._start(fit)
+                return np.zeros(3)
+            self._wild = fit.seen, fit.spread
+        total = total * max(1.0, distance / self.GATE)
+        gain = np.linalg.solve(total, self._covariance[_SEEN]).T
+        self._state = self._state + gain @ apart
+        covariance = self._covariance - gain @ self._covariance[_SEEN]
+        self._covariance = (covariance + covariance.T) / 2
+        return apart if distance > self.GATE else np.zeros(3)
+
+
+def _squared(apart: Floats, covariance: Floats) -> float:
+    """Return the squared Mahalanobis distance."""
+    return float(apart @ np.linalg.solve(covariance, apart))
 
 
 def _lane_at(centre: GroundCurve, x: float) -> float:

@@ -13,7 +13,7 @@ from trilitenet.errors import ShapeError
 from trilitenet.processing.geometry import Camera
 from trilitenet.processing.polygons import mask_to_polygons
 from trilitenet.road.camera import CameraErrors, SelfCalibration
-from trilitenet.road.ego import LaneFit, LeadFilter, find_distances, find_lead, fit_ego_lane, ground_curve
+from trilitenet.road.ego import LaneFilter, LaneFit, LeadFilter, find_distances, find_lead, fit_ego_lane, ground_curve
 from trilitenet.road.events import EventDetector, EventThresholds
 from trilitenet.road.lanes import assign_positions, find_lines, vanishing_point
 from trilitenet.road.structures import Estimate, LaneLine, Road
@@ -47,6 +47,7 @@ class RoadMonitor:
         self._assumed = (field_of_view, lane_width)
         self._still = still
         self._events = EventDetector(thresholds)
+        self._lane = LaneFilter()
         self._lead = LeadFilter()
         self._size: tuple[int, int] | None = None
         self._camera: Camera | None = None
@@ -84,7 +85,8 @@ class RoadMonitor:
             self._calibration.update(lines)
         distances = () if perception.boxes is None else find_distances(perception.boxes, camera, errors)
         road = Road(tuple(lines), drivable, camera=camera, calibrated=calibrated, distances=distances)
-        fit = fit_ego_lane(*road.ego_lines, camera, errors, known_width=self._width)
+        usual = CameraErrors() if self._calibration is None else self._calibration.errors
+        fit = fit_ego_lane(*road.ego_lines, camera, errors, usual=usual, known_width=self._width)
         if fit is not None:
             road = self._with_lane(road, fit, perception, camera, errors, timestamp)
         if not self._still:
@@ -144,7 +146,7 @@ class RoadMonitor:
             lead = find_lead(perception.boxes, fit, camera, errors)
             if not self._still:
                 lead = self._lead.update(lead, perception.boxes, timestamp, camera)
-        lane = fit.lane
+        lane = fit.lane if self._still else self._lane.update(fit, timestamp)
         if lane.width is None and lane.offset is not None:
             lane = dataclasses.replace(lane, width=self._width)
         return dataclasses.replace(road, ego_lane=lane, lead=lead)

@@ -118,6 +118,8 @@ class LaneLine:
 class EgoLane:
     """The lane that the vehicle is in.
 
+    In a video all but the width rest on the frames so far, too (`trilitenet.road.ego.LaneFilter`).
+
     Attributes:
         width: Metres; None with only one line of the lane in sight.
         offset: Metres the camera is left of the lane's centre.
