@@ -63,3 +63,9 @@ def test_a_size_that_the_network_cannot_take_is_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=f"--size must be multiples of 32, got {size[0]}x{size[1]}"):
         benchmark(size=size, table=table)
+
+
+@pytest.mark.parametrize("options", [{"threads": 0}, {"threads": -1}, {"streams": 0}])
+def test_no_threads_or_streams_are_refused(options: dict[str, int]) -> None:
+    with pytest.raises(ConfigError, match="--streams and --threads must be at least 1"):
+        benchmark(threads=options.get("threads"), streams=options.get("streams", 1))

@@ -130,6 +130,13 @@ def test_negative_counts_are_refused_before_the_work(
         evaluate(str(weights), data=data, save=tmp_path / "out", resamples=resamples, worst=worst)
     with pytest.raises(ConfigError, match=message):
         score(run[1] / "predictions", data=data, output=tmp_path / "out", resamples=resamples, worst=worst)
+    for limit in (0, -1):
+        with pytest.raises(ConfigError, match=f"--limit must be at least 1, got {limit}"):
+            evaluate(str(weights), data=data, limit=limit)
+        with pytest.raises(ConfigError, match=f"--limit must be at least 1, got {limit}"):
+            score(run[1] / "predictions", data=data, limit=limit)
+    with pytest.raises(ConfigError, match="--resamples must not be negative"):
+        compare(run[1], resamples=-1)
     assert not (tmp_path / "out").exists()
 
 

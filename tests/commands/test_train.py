@@ -301,6 +301,8 @@ def test_refusals(scenes: Path, tmp_path: Path) -> None:
     for name, value in wrong.items():
         with pytest.raises(ConfigError, match=name):
             train(data="x", **{name: value})
+    with pytest.raises(ConfigError, match="3 levels of 3 sizes"):
+        train(data="x", anchors=[[[1, 2]] * 3] * 2)
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputError, match=r"file.*cannot be written"):
         train(**settings(scenes, tmp_path / "file" / "run", max_steps=1))

@@ -168,6 +168,8 @@ def benchmark(
     """
     if min(rounds, *batch) < 1 or warmup < 0:
         raise ConfigError("--rounds and --batch must be at least 1, --warmup not negative")
+    if streams < 1 or (threads is not None and threads < 1):
+        raise ConfigError(f"--streams and --threads must be at least 1, got {streams} and {threads}")
     if min(size) < MAX_STRIDE or any(side % MAX_STRIDE for side in size):
         raise ConfigError(f"--size must be multiples of {MAX_STRIDE}, got {size[0]}x{size[1]}")
     machine = _machine(threads, streams)

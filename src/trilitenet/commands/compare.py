@@ -25,13 +25,15 @@ def compare(
         published: Add the rows of the paper's tables, each marked with how it was measured.
         output: Folder to write comparison.json and comparison.html to.
         overwrite: Replace a comparison that is there.
-        resamples: Bootstrap draws of the images, the same for every model.
+        resamples: Bootstrap draws of the images, the same for every model; 0 for none.
 
     Returns:
         The comparison.
     """
     if not reports:
         raise ConfigError("give at least one report.json, or a folder that holds one")
+    if resamples < 0:
+        raise ConfigError(f"--resamples must not be negative, got {resamples}; 0 is for none")
     if output is not None and not overwrite and (output / "comparison.json").exists():
         raise OutputError(f"{output}: holds comparison.json already; give another folder or --overwrite")
     named: dict[str, Report] = {}

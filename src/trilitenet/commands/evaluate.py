@@ -87,7 +87,7 @@ def evaluate(
         ConfigError: If a count is negative, or an artefact has decided already what a protocol decides.
         OutputError: If there is a report already.
     """
-    check_counts(resamples, worst)
+    check_counts(resamples, worst, limit)
     check_output(output, overwrite)
     predictor = load(
         model,
@@ -201,8 +201,8 @@ def hash_dataset(dataset: DrivingDataset, limit: int | None = None) -> dict[str,
     }
 
 
-def check_counts(resamples: int, worst: int) -> None:
-    """Refuse, before hours of work, counts that are negative.
+def check_counts(resamples: int, worst: int = 0, limit: int | None = None) -> None:
+    """Refuse, before hours of work, counts that are negative, and a limit of no images.
 
     Raises:
         ConfigError: If one is.
@@ -210,6 +210,8 @@ def check_counts(resamples: int, worst: int) -> None:
     for option, value in (("resamples", resamples), ("worst", worst)):
         if value < 0:
             raise ConfigError(f"--{option} must not be negative, got {value}; 0 is for none")
+    if limit is not None and limit < 1:
+        raise ConfigError(f"--limit must be at least 1, got {limit}; leave it out for all images")
 
 
 def check_output(output: Path | None, overwrite: bool) -> None:

@@ -58,7 +58,7 @@ def score(
         ConfigError: If a count is negative.
         OutputError: If there is a report already.
     """
-    check_counts(resamples, worst)
+    check_counts(resamples, worst, limit)
     check_output(output, overwrite)
     dataset = DrivingDataset(data, split, class_names=tuple(classes))
     saved = SavedPredictions(predictions, classes)
