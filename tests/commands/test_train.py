@@ -331,6 +331,17 @@ def test_a_prepared_data_set_is_trained_on_without_validation(scenes: Path, tmp_
     assert train(augmentation__mask_above=64, **options).steps == 1
 
 
+@pytest.mark.parametrize("part", ["network", "optimiser", "random"])
+def test_a_checkpoint_with_the_wrong_content_is_told_in_one_line(scenes: Path, tmp_path: Path, part: str) -> None:
+    train(**settings(scenes, tmp_path, max_steps=1))
+    path = tmp_path / "last.ckpt"
+    whole = torch.load(path, weights_only=True)
+    torch.save({**whole, part: {}}, path)
+    with pytest.raises(WeightsError, match=r"last\.ckpt: does not fit this run") as caught:
+        train(resume=True, **settings(scenes, tmp_path, max_steps=2))
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("recipe", RECIPES, ids=lambda path: path.stem)
 def test_every_recipe_runs_three_steps(recipe: Path, scenes: Path, tmp_path: Path) -> None:
     result = train(recipe, **settings(scenes, tmp_path, epochs=2, max_steps=3, batch_size=2))

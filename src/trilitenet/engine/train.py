@@ -27,7 +27,7 @@ from trilitenet.engine.recipe import TrainConfig
 from trilitenet.engine.rescale import draw_size, rescale
 from trilitenet.engine.runtime import StopRequest
 from trilitenet.engine.transfer import keep_frozen
-from trilitenet.errors import WeightsError, writing
+from trilitenet.errors import TriLiteNetError, WeightsError, brief, writing
 from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.losses.multitask import LossTerms, MultiTaskLoss
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
@@ -409,6 +409,16 @@ class Trainer:
                     f"{path}: was trained with {name} {theirs[name]!r}, this run has {ours[name]!r}; "
                     "set it alike, or start anew with --init"
                 )
+        try:
+            self._take_over(state)
+        except TriLiteNetError:
+            raise
+        except (RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
+            raise WeightsError(
+                f"{path}: does not fit this run ({brief(error)}); start anew with --overwrite"
+            ) from error
+
+    def _take_over(self, state: Mapping[str, Any]) -> None:
         self.network.load_state_dict(state["network"])
         if self.loss.detection is not None:
             self.loss.detection.anchors.copy_(self.network.anchors)
