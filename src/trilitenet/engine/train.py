@@ -414,9 +414,8 @@ class Trainer:
         except TriLiteNetError:
             raise
         except (RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
-            raise WeightsError(
-                f"{path}: does not fit this run ({brief(error)}); start anew with --overwrite"
-            ) from error
+            reason = brief(error)[:200]  # of a network it names every tensor
+            raise WeightsError(f"{path}: does not fit this run ({reason}); start anew with --overwrite") from error
 
     def _take_over(self, state: Mapping[str, Any]) -> None:
         self.network.load_state_dict(state["network"])
