@@ -37,6 +37,8 @@ __all__ = [
     "Task",
     "Thresholds",
     "VariantConfig",
+    "check_anchors",
+    "check_size",
     "check_tasks",
     "get_variant",
     "parse",
@@ -190,13 +192,7 @@ class ModelCard:
     schema: int = CARD_SCHEMA
 
     def __post_init__(self) -> None:
-        if [len(level) for level in self.anchors] != [3] * len(STRIDES):
-            raise ConfigError(
-                f"anchors must be {len(STRIDES)} levels of 3 sizes, got {[len(level) for level in self.anchors]}"
-            )
-        for side in (side for level in self.anchors for pair in level for side in pair):
-            if not 0 < side < math.inf:
-                raise ConfigError(f"anchors must be above 0 and finite, got {side}")
+        check_anchors(self.anchors)
 
     @property
     def classes(self) -> int:
@@ -300,6 +296,30 @@ def parse(cls: type[_T], mapping: Mapping[str, Any], source: str) -> _T:
         return _adapter(cls).validate_python(dict(mapping))
     except ValidationError as error:
         raise ConfigError(f"{source}: {_explain(cls, error)}") from error
+
+
+def check_size(size: tuple[int, int], name: str = "size") -> None:
+    """Refuse a (height, width) of the input that the network cannot take; ``name`` is what messages call it.
+
+    Raises:
+        ConfigError: If a side is no positive multiple of `MAX_STRIDE`.
+    """
+    if min(size) < MAX_STRIDE or any(side % MAX_STRIDE for side in size):
+        raise ConfigError(f"{name} must be multiples of {MAX_STRIDE}, got {size[0]}x{size[1]} (height x width)")
+
+
+def check_anchors(anchors: Anchors) -> None:
+    """Refuse anchors that no head can use.
+
+    Raises:
+        ConfigError: If they are not 3 sizes a level, above 0 and finite.
+    """
+    counts = [len(level) for level in anchors]
+    if counts != [3] * len(STRIDES):
+        raise ConfigError(f"anchors must be {len(STRIDES)} levels of 3 sizes, got {counts}")
+    for side in (side for level in anchors for pair in level for side in pair):
+        if not 0 < side < math.inf:
+            raise ConfigError(f"anchors must be above 0 and finite, got {side}")
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:

@@ -72,6 +72,14 @@ def test_suppression_needs_boxes(tmp_path: Path) -> None:
         export(str(tmp_path / "lane.safetensors"), nms=True, output=tmp_path / "a.onnx")
 
 
+@pytest.fixture
+def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fail where a network would be loaded; TensorRT is not there."""
+    monkeypatch.setattr(command, "is_installed", lambda: False)
+    monkeypatch.setattr(command, "load_network", _no_work)
+
+
+@pytest.mark.usefixtures("no_work")
 @pytest.mark.parametrize(
     ("format_", "name", "other"),
     [
@@ -81,11 +89,7 @@ def test_suppression_needs_boxes(tmp_path: Path) -> None:
         ("ncnn", "a.ncnn.param", "a.ncnn.json"),
     ],
 )
-def test_no_file_is_replaced_unasked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format_: Any, name: str, other: str
-) -> None:
-    monkeypatch.setattr(command, "is_installed", lambda: False)
-    monkeypatch.setattr(command, "load_network", _no_work)
+def test_no_file_is_replaced_unasked(tmp_path: Path, format_: Any, name: str, other: str) -> None:
     (tmp_path / other).write_text("mine")
     with pytest.raises(
         OutputError, match=f"^{tmp_path / other}: exists already; give another --output or --overwrite$"
@@ -94,6 +98,7 @@ def test_no_file_is_replaced_unasked(
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(other, "mine")]
 
 
+@pytest.mark.usefixtures("no_work")
 @pytest.mark.parametrize(
     ("format_", "output", "told"),
     [
@@ -103,11 +108,7 @@ def test_no_file_is_replaced_unasked(
         ("triton", "file", "file/tiny/config.pbtxt"),
     ],
 )
-def test_a_file_in_the_place_of_a_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format_: Any, output: str, told: str
-) -> None:
-    monkeypatch.setattr(command, "is_installed", lambda: False)
-    monkeypatch.setattr(command, "load_network", _no_work)
+def test_a_file_in_the_place_of_a_folder(tmp_path: Path, format_: Any, output: str, told: str) -> None:
     (tmp_path / "file").touch()
     reason = rf"cannot be written \({tmp_path / 'file'} is no folder\)"
     with pytest.raises(OutputError, match=f"^{tmp_path / told}: {reason}$"):

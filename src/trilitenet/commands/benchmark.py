@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 import trilitenet
 from trilitenet.commands.load import load
-from trilitenet.config import MAX_STRIDE, VARIANTS
-from trilitenet.errors import ConfigError, OutputError, import_extra
+from trilitenet.config import VARIANTS, check_size
+from trilitenet.errors import ConfigError, OutputError, import_extra, writing
 from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.cores import usable_cores
 
@@ -170,8 +170,7 @@ def benchmark(
         raise ConfigError("--rounds and --batch must be at least 1, --warmup not negative")
     if streams < 1 or (threads is not None and threads < 1):
         raise ConfigError(f"--streams and --threads must be at least 1, got {streams} and {threads}")
-    if min(size) < MAX_STRIDE or any(side % MAX_STRIDE for side in size):
-        raise ConfigError(f"--size must be multiples of {MAX_STRIDE}, got {size[0]}x{size[1]}")
+    check_size(size, "--size")
     machine = _machine(threads, streams)
     if table == "cost":
         result = Benchmark((), _costs(size), machine, 0, None)
@@ -185,11 +184,9 @@ def benchmark(
         for entry in entries:
             entry.predictor.close()
     if output is not None:
-        try:
+        with writing(output):
             output.parent.mkdir(parents=True, exist_ok=True)
             output.write_text(json.dumps(result.to_dict(), indent=2) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"{output}: cannot be written ({error})") from error
     return result
 
 

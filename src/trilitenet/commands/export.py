@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 import trilitenet
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY, MAX_STRIDE, ArtefactInfo, Task
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, MAX_STRIDE, ArtefactInfo, Task, check_size
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.deploy.graph import DeployGraph, Masks
 from trilitenet.deploy.layouts import pick_layout
@@ -315,10 +315,9 @@ def _parse_size(size: str) -> tuple[int, int] | None:
     match = re.fullmatch(r"(\d+)x(\d+)", size)
     if match is None:
         raise ConfigError(f"--size is HEIGHTxWIDTH such as 384x640, or dynamic, not {size!r}")
-    height, width = int(match[1]), int(match[2])
-    if not height or not width or height % MAX_STRIDE or width % MAX_STRIDE:
-        raise ConfigError(f"--size must be multiples of {MAX_STRIDE}, got {height}x{width}")
-    return height, width
+    canvas = int(match[1]), int(match[2])
+    check_size(canvas, "--size")
+    return canvas
 
 
 def _canvases(source: Path | None, canvas: tuple[int, int], count: int, split: str = "val") -> list[NDArray[np.uint8]]:

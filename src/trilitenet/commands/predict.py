@@ -282,42 +282,32 @@ class _Job:
     def _check_formats(self) -> None:
         """Refuse formats that do not exist, and files that exist or would be written twice."""
         planned: dict[str, str] = {}
-        numbered: list[tuple[str, re.Pattern[str], str]] = []
-
-        def plan(file: str, what: str) -> None:
-            if file in planned:
+        for file, what in sorted(self._plan(), key=lambda one: "*" not in one[0]):
+            for taken in {file, _numbered(file)} & planned.keys():
                 raise OutputError(
-                    f"{self.output / file} would be written twice, {planned[file]} and {what}; "
+                    f"{self.output / file} would be written twice, {planned[taken]} and {what}; "
                     "rename a source, or give the formats an --output each"
                 )
             planned[file] = what
-            if not self.overwrite and (self.output / file).exists():
-                raise OutputError(f"{self.output / file}: exists already; choose another --output or add --overwrite")
+        if self.overwrite:
+            return
+        found = [self.output / file for file in planned if (self.output / file).exists()]
+        for folder in {(self.output / file).parent for file in planned if "*" in file}:
+            for path in folder.iterdir() if folder.is_dir() else ():
+                if _numbered(path.relative_to(self.output).as_posix()) in planned:
+                    found.append(path)
+        if found:
+            raise OutputError(f"{found[0]}: exists already; choose another --output or add --overwrite")
 
+    def _plan(self) -> Iterator[tuple[str, str]]:
+        """Yield each file that the formats will write, ``*`` for a number a frame, and what it is."""
         for name in self.formats:
             writer = find_writer(name)
-            for file in writer.FILES:
-                plan(file, f"as all of {name}")
-            if any(isinstance(source, Stills) for source in self.sources):
-                for file in writer.PICTURE_FILES:
-                    if "{}" not in file:
-                        plan(file, f"as the pictures of {name}")
+            files = dict.fromkeys(writer.FILES, "everything")
             for source in self.sources:
-                for pattern in writer.PICTURE_FILES if isinstance(source, Stills) else writer.VIDEO_FILES:
-                    for each in _names(source) if "{}" in pattern else ():
-                        file, what = pattern.format(self.stems[each]), f"as {name} of {each}"
-                        if "*" in pattern:
-                            number = re.escape(pattern).replace(r"\*", r"\d+")
-                            number = number.replace(r"\{\}", re.escape(self.stems[each]))
-                            numbered.append((file, re.compile(number), what))
-                        else:
-                            plan(file, what)
-        for file, frames, what in numbered:
-            place = self.output / PurePath(file).parent
-            there = () if self.overwrite or not place.is_dir() else place.iterdir()
-            for other in [*planned, *(path.relative_to(self.output).as_posix() for path in there)]:
-                if frames.fullmatch(other):
-                    plan(other, what)
+                patterns = writer.PICTURE_FILES if isinstance(source, Stills) else writer.VIDEO_FILES
+                files |= {pattern.format(self.stems[each]): each for pattern in patterns for each in _names(source)}
+            yield from ((file, f"as {name} of {each}") for file, each in files.items())
 
     def run(
         self,
@@ -448,6 +438,11 @@ def _follow(perception: Perception, parts: tuple[Steady | None, RoadMonitor | No
 
 def _names(source: Stills | FrameReader) -> list[str]:
     return [str(path) for path in source.paths] if isinstance(source, Stills) else [source.name]
+
+
+def _numbered(file: str) -> str:
+    """Return the name of a frame's file with ``*`` for its number, any other as it is."""
+    return re.sub(r"-\d+(\.\w+)$", r"-*\1", file)
 
 
 def _allot_stems(names: Sequence[str]) -> dict[str, str]:

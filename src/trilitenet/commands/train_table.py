@@ -10,6 +10,7 @@ import yaml
 
 from trilitenet.commands.tables import markdown_row
 from trilitenet.commands.train import train
+from trilitenet.config import read_yaml
 from trilitenet.engine.train import CHECKPOINT_NAME
 from trilitenet.errors import ConfigError, brief
 from trilitenet.models.cost import count_multiply_adds, count_parameters
@@ -113,9 +114,9 @@ def train_table(table: Path, /, *, data: Path, output: Path, resume: bool = Fals
 
 
 def _read(table: Path) -> tuple[str, dict[str, Path]]:
+    content = read_yaml(table)
     try:
-        content = yaml.safe_load(table.read_text(encoding="utf-8"))
         rows = {str(name): table.parent / str(recipe) for name, recipe in content["rows"].items()}
         return str(content["title"]), rows
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{table}: must hold a title and rows of 'name: recipe' ({brief(error)})") from error

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from trilitenet.commands.load import load
-from trilitenet.config import MAX_STRIDE, ModelCard, parse, read_yaml
+from trilitenet.config import ModelCard, check_size, parse, read_yaml
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.evaluate import best_thresholds
 from trilitenet.engine.evaluate import evaluate as run_evaluation
-from trilitenet.errors import ConfigError, OutputError
+from trilitenet.errors import OutputError
 from trilitenet.models.weights import import_published, load_network, read_card, resolve_weights, save_network
 
 __all__ = ["CardText", "finish", "import_weights", "info"]
@@ -98,8 +98,8 @@ def finish(
     """
     if destination.exists() and not overwrite:
         raise OutputError(f"{destination}: exists already; give another name or --overwrite")
-    if input_size is not None and (min(input_size) < MAX_STRIDE or any(side % MAX_STRIDE for side in input_size)):
-        raise ConfigError(f"--input-size must be multiples of {MAX_STRIDE}, got {input_size[0]}x{input_size[1]}")
+    if input_size is not None:
+        check_size(input_size, "--input-size")
     network = load_network(source)
     described = _describe(network.card, [_read_card_text(path) for path in card])
     if input_size is not None:

@@ -30,7 +30,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import MAX_STRIDE, Task
+from trilitenet.config import Task, check_size
 from trilitenet.data.description import read_description
 from trilitenet.data.reading import (
     DETECTION_FOLDER,
@@ -484,8 +484,7 @@ def _settings(plan: _Plan) -> dict[str, Any]:
 
 
 def _check(canvas: tuple[int, int], quality: int, mask_above: int, shard_size: int) -> None:
-    if min(canvas) < MAX_STRIDE or any(side % MAX_STRIDE for side in canvas):
-        raise ConfigError(f"the size must be multiples of {MAX_STRIDE}, as training's is, got {canvas}")
+    check_size(canvas)
     if not (1 <= quality <= 100 and 0 <= mask_above <= 254 and shard_size >= 1):
         raise ConfigError(
             "quality must be in 1 .. 100, mask_above in 0 .. 254 and shard_size at least 1, "

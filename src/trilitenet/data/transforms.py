@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import MAX_STRIDE
+from trilitenet.config import check_size
 from trilitenet.data import photometric
 from trilitenet.data.sample import Sample
 from trilitenet.errors import ConfigError
@@ -287,7 +287,7 @@ class EvalTransform:
     canvas: tuple[int, int] = (384, 640)
 
     def __post_init__(self) -> None:
-        _check_canvas(self.canvas)
+        check_size(self.canvas, "canvas")
 
     def __call__(
         self,
@@ -325,7 +325,7 @@ class TrainTransform:
     strength: Augmentation = Augmentation()
 
     def __post_init__(self) -> None:
-        _check_canvas(self.canvas)
+        check_size(self.canvas, "canvas")
 
     def __call__(
         self, sample: Sample, rng: np.random.Generator, draw: Callable[[np.random.Generator], Sample] | None = None
@@ -476,11 +476,6 @@ def _crop(sample: Sample, top: int, left: int, height: int, width: int) -> Sampl
         lane=None if sample.lane is None else sample.lane[area],
         valid=None if sample.valid is None else sample.valid[area],
     )
-
-
-def _check_canvas(canvas: tuple[int, int]) -> None:
-    if min(canvas) < MAX_STRIDE or canvas[0] % MAX_STRIDE or canvas[1] % MAX_STRIDE:
-        raise ConfigError(f"canvas must be multiples of {MAX_STRIDE}, got {canvas[0]}x{canvas[1]} (height x width)")
 
 
 def _resize(array: NDArray[np.uint8], box: Letterbox) -> NDArray[np.uint8]:

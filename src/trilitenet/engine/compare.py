@@ -19,7 +19,7 @@ from trilitenet.engine.figures import HEADLINES, meaning
 from trilitenet.engine.page import escape, interval_plot, page, percent, section, table
 from trilitenet.engine.published_rows import PUBLISHED_ROWS, PublishedRow
 from trilitenet.engine.report import Report, render
-from trilitenet.errors import ConfigError, OutputError
+from trilitenet.errors import ConfigError, writing
 from trilitenet.metrics.bootstrap import bootstrap, interval
 
 __all__ = ["COMPARISON_SCHEMA", "Comparison", "Difference", "compare_reports"]
@@ -98,13 +98,11 @@ class Comparison:
         Raises:
             OutputError: If they cannot be written.
         """
-        try:
+        with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
             text = json.dumps(self.to_dict(), ensure_ascii=False, indent=1) + "\n"
             (folder / "comparison.json").write_text(text, encoding="utf-8")
             (folder / "comparison.html").write_text(_comparison_page(self), encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"{folder}: cannot be written ({error.strerror})") from error
 
     def summary(self) -> str:
         """Return the comparison as text for a terminal."""

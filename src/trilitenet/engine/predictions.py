@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import TASKS, Task
-from trilitenet.errors import DataError, OutputError, brief
+from trilitenet.errors import DataError, OutputError, brief, writing
 from trilitenet.structures import Boxes, Perception
 
 __all__ = ["DETECTIONS_FILE", "PredictionWriter", "SavedPredictions"]
@@ -53,7 +53,7 @@ class PredictionWriter:
         held = [name for name in (DETECTIONS_FILE, "drivable", "lane") if (folder / name).exists()]
         if held and not overwrite:
             raise OutputError(f"{folder}: holds {held[0]} already; give another folder or --overwrite")
-        try:
+        with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
             for task in self._tasks:
                 if task != "detection":
@@ -61,8 +61,6 @@ class PredictionWriter:
             if "detection" in self._tasks:
                 self._file = (folder / DETECTIONS_FILE).open("w", encoding="utf-8")
                 self._file.write("[")
-        except OSError as error:
-            raise OutputError(f"{folder}: cannot be written ({error.strerror})") from error
 
     def __enter__(self) -> PredictionWriter:
         return self
@@ -95,10 +93,8 @@ class PredictionWriter:
             if mask is not None:
                 path = self.folder / task / f"{name}.png"
                 encoded = cv2.imencode(".png", mask.astype(np.uint8) * 255)[1]
-                try:
+                with writing(path):
                     path.write_bytes(bytes(np.asarray(encoded, np.uint8)))
-                except OSError as error:
-                    raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
 
     def close(self) -> None:
         """Finish ``detections.json``. Calling it twice is harmless."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from trilitenet.config import STRIDES, TASKS, Anchors, Task, get_variant, parse, read_yaml
+from trilitenet.config import TASKS, Anchors, Task, check_anchors, get_variant, parse, read_yaml
 from trilitenet.data.transforms import Augmentation
 from trilitenet.errors import ConfigError
 
@@ -184,10 +184,7 @@ class TrainConfig:
         if not all(0 <= beta < 1 for beta in self.betas):
             raise ConfigError(f"betas must be in [0, 1), got {self.betas}")
         if self.anchors is not None:
-            if [len(level) for level in self.anchors] != [3] * len(STRIDES):
-                raise ConfigError(f"anchors must be {len(STRIDES)} levels of 3 sizes, got {self.anchors}")
-            if not all(side > 0 for level in self.anchors for pair in level for side in pair):
-                raise ConfigError(f"anchors must be above 0, got {self.anchors}")
+            check_anchors(self.anchors)
         if not 0 <= self.ema_decay < 1:
             raise ConfigError(f"ema_decay must be in [0, 1), got {self.ema_decay}")
 

@@ -20,7 +20,7 @@ from rich.text import Text
 from trilitenet.engine.figures import CONDITION_FIGURES, HEADLINES, meaning
 from trilitenet.engine.page import percent
 from trilitenet.engine.scoring import FairMetrics, FairScores, PaperMetrics, PaperScores
-from trilitenet.errors import DataError, OutputError, brief
+from trilitenet.errors import DataError, brief, writing
 
 __all__ = [
     "FEW_IMAGES",
@@ -452,8 +452,6 @@ def _without_nan(value: Any) -> Any:
 
 
 def _write(path: Path, text: str) -> None:
-    try:
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror})") from error

@@ -27,7 +27,7 @@ from trilitenet.engine.recipe import TrainConfig
 from trilitenet.engine.rescale import draw_size, rescale
 from trilitenet.engine.runtime import StopRequest
 from trilitenet.engine.transfer import keep_frozen
-from trilitenet.errors import TriLiteNetError, WeightsError, brief, writing
+from trilitenet.errors import WeightsError, brief, writing
 from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.losses.multitask import LossTerms, MultiTaskLoss
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
@@ -411,11 +411,11 @@ class Trainer:
                 )
         try:
             self._take_over(state)
-        except TriLiteNetError:
-            raise
         except (RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
             reason = brief(error)[:200]  # of a network it names every tensor
             raise WeightsError(f"{path}: does not fit this run ({reason}); start anew with --overwrite") from error
+        self._read_best()
+        self.guard.look()
 
     def _take_over(self, state: Mapping[str, Any]) -> None:
         self.network.load_state_dict(state["network"])
@@ -429,8 +429,6 @@ class Trainer:
             self.fabric._precision.load_state_dict(state["scaler"])
         self.step, self.stale = int(state["step"]), int(state.get("stale", 0))
         self.best, self.metrics = dict(state["best"]), dict(state["metrics"])
-        self._read_best()
-        self.guard.look()
         set_random_state(state["random"])
 
     def _read_best(self) -> None:

@@ -16,7 +16,7 @@ import yaml
 from numpy.typing import NDArray
 
 from trilitenet.config import parse
-from trilitenet.errors import ConfigError, OutputError
+from trilitenet.errors import ConfigError, writing
 from trilitenet.processing.geometry import Camera
 from trilitenet.road.lanes import vanishing_point
 from trilitenet.road.structures import LaneLine
@@ -125,10 +125,8 @@ def write_camera(camera: Camera, path: str | Path) -> None:
         "height": camera.height,
         **{name: math.degrees(getattr(camera, name)) for name in ("pitch", "yaw", "roll")},
     }
-    try:
+    with writing(path):
         Path(path).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error})") from error
 
 
 class SelfCalibration:

@@ -327,9 +327,10 @@ class LaneFilter:
             # Into the next lane, if that is what fits: one stray line must not do it.
             if distance > self.GATE and abs(self._state[0] + across) < fit.half_width + MAX_OUTSIDE:
                 rest = apart - np.array([across, 0.0, 0.0])
-                if _squared(rest, total) <= self.GATE:
+                other = _squared(rest, total)
+                if other <= self.GATE:
                     self._state[0] += across
-                    apart, distance = rest, _squared(rest, total)
+                    apart, distance = rest, other
         wild, self._wild = self._wild, None
         if distance > self.GATE:
             moved = np.diag(np.square([self.MAX_RATE * step, 0.05 * step, 0.0]))

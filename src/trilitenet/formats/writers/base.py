@@ -20,7 +20,7 @@ from pathlib import Path, PurePath
 from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, ClassVar, Final
 
-from trilitenet.errors import ConfigError, OutputError, did_you_mean
+from trilitenet.errors import ConfigError, OutputError, did_you_mean, writing
 from trilitenet.structures import Perception
 
 if TYPE_CHECKING:
@@ -112,10 +112,8 @@ class Writer(abc.ABC):
         path = self.output / name
         if path.exists() and not self.overwrite:
             raise OutputError(f"{path} exists; choose another --output or add --overwrite")
-        try:
+        with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"{path.parent}: cannot be made ({error.strerror})") from error
         self._begun.append(path)
         return path
 
