@@ -20,6 +20,8 @@ from __future__ import annotations
 import contextlib
 import difflib
 import importlib
+import os
+import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -38,6 +40,7 @@ __all__ = [
     "brief",
     "did_you_mean",
     "import_extra",
+    "replacing",
     "writing",
 ]
 
@@ -125,3 +128,24 @@ def writing(output: str | Path) -> Iterator[None]:
         if isinstance(error, TriLiteNetError):
             raise
         raise OutputError(f"{error.filename or output}: cannot be written ({error.strerror or error})") from error
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a name beside ``path``; the file written there takes its place in one step once the block is through.
+
+    At any time ``path`` is either the old file or the new one, whole; if the block raises, nothing of it stays.
+
+    Args:
+        path: The file to write; its folder exists.
+    """
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    os.close(handle)
+    part = Path(name)
+    try:
+        yield part
+        part.chmod(0o644)  # a temporary file is private
+        part.replace(path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise

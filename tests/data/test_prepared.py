@@ -113,7 +113,9 @@ def test_twice_changes_nothing_and_changes_are_seen(root: Path, tmp_path: Path) 
     later = (out / "prepared.json").stat().st_mtime + 10
     os.utime(path, (later, later))
     (root / "images/train/train_0010.jpg").unlink()
+    (out / ".train-000001.tar.x7.part").write_bytes(b"of a run that was killed")
     prepare(root, out, canvas=CANVAS, shard_size=4)
+    assert not list(out.glob(".*"))
     after = {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in out.glob("train-*")}
     assert after["train-000000.tar"] == before["train-000000.tar"]
     assert after["train-000001.tar"] != before["train-000001.tar"]

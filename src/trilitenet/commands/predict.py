@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
-import os
 import re
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePath
@@ -22,7 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.text import Text
 
 from trilitenet.commands.load import load
-from trilitenet.errors import BackendError, InputError, OutputError, ShapeError, writing
+from trilitenet.errors import BackendError, InputError, OutputError, ShapeError, replacing, writing
 from trilitenet.formats.writers.base import Writer, find_writer, open_writer
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, Failure, FrameReader, Stills, find_sources
@@ -465,15 +463,8 @@ def _write_jpeg(path: Path, image: NDArray[np.uint8]) -> None:
     done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     if not done:
         raise OutputError(f"{path}: the overlay cannot be encoded as JPEG")
-    handle, partial = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data.tobytes())
-        Path(partial).chmod(0o644)
-        Path(partial).replace(path)
-    except BaseException:
-        Path(partial).unlink(missing_ok=True)
-        raise
+    with replacing(path) as part:
+        part.write_bytes(data.tobytes())
 
 
 class _Speed(ProgressColumn):

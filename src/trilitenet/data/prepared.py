@@ -42,7 +42,7 @@ from trilitenet.data.reading import (
     decode_image,
 )
 from trilitenet.data.sample import Sample
-from trilitenet.errors import ConfigError, DataError, OutputError, import_extra, writing
+from trilitenet.errors import ConfigError, DataError, OutputError, import_extra, replacing, writing
 from trilitenet.processing.letterbox import Letterbox
 
 __all__ = ["PREPARED_FILE", "PreparedDataset", "is_prepared", "open_dataset", "prepare", "shrink"]
@@ -351,14 +351,16 @@ class _Place:
         path = self.cache / name
         if not path.is_file():
             path.parent.mkdir(parents=True, exist_ok=True)
-            part = path.with_name(f".{path.name}.part")
             opener = import_extra("webdataset", "data").gopen
             try:
-                with opener(f"{self.root.rstrip('/')}/{name}") as source, part.open("wb") as target:
+                with (
+                    replacing(path) as part,
+                    opener(f"{self.root.rstrip('/')}/{name}") as source,
+                    part.open("wb") as target,
+                ):
                     shutil.copyfileobj(source, target)
             except (OSError, ValueError) as error:
                 raise DataError(f"{self.root}/{name}: cannot be fetched ({error})") from error
-            part.replace(path)
         return path
 
 
@@ -391,21 +393,18 @@ def _write_shard(plan: _Plan, split: str, number: int, names: list[str]) -> int:
         there = [json.loads(line)["name"] for line in index.read_bytes().splitlines()]
         if there == names and index.stat().st_mtime >= _newest(dataset):
             return len(names)
-    part = path.with_name(f".{path.name}.part")
     entries: list[dict[str, Any]] = []
-    with tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as tar:
-        for sample in dataset:
-            members, entry = _encode(shrink(sample, plan.canvas, plan.mask_above), plan)
-            for ending, data in members.items():
-                member = tarfile.TarInfo(f"{_key(sample.name)}.{ending}")
-                member.size = len(data)
-                tar.addfile(member, io.BytesIO(data))
-            entries.append(entry)
-    _locate(part, entries)
-    index_part = index.with_name(f".{index.name}.part")
-    index_part.write_text("".join(json.dumps(entry) + "\n" for entry in entries), encoding="utf-8")
-    part.replace(path)
-    index_part.replace(index)
+    with replacing(index) as index_part, replacing(path) as part:
+        with tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as tar:
+            for sample in dataset:
+                members, entry = _encode(shrink(sample, plan.canvas, plan.mask_above), plan)
+                for ending, data in members.items():
+                    member = tarfile.TarInfo(f"{_key(sample.name)}.{ending}")
+                    member.size = len(data)
+                    tar.addfile(member, io.BytesIO(data))
+                entries.append(entry)
+        _locate(part, entries)
+        index_part.write_text("".join(json.dumps(entry) + "\n" for entry in entries), encoding="utf-8")
     return len(names)
 
 
@@ -501,6 +500,8 @@ def _open_out(plan: _Plan) -> None:
     elif plan.out.is_dir() and any(plan.out.iterdir()):
         raise OutputError(f"{plan.out}: is not empty and not prepared earlier; choose another folder")
     plan.out.mkdir(parents=True, exist_ok=True)
+    for part in plan.out.glob(".*.part"):  # of a run that was killed
+        part.unlink()
     if not state.is_file():
         state.write_text(json.dumps({**_settings(plan), "splits": {}, "shards": {}}), encoding="utf-8")
 
@@ -521,9 +522,8 @@ def _write_state(plan: _Plan, datasets: Mapping[str, SampleSource]) -> None:
                 (plan.out / _index_name(name)).unlink(missing_ok=True)
         shards[split] = kept
     text = json.dumps({**_settings(plan), "splits": splits, "shards": shards}, indent=1, sort_keys=True)
-    part = plan.out / f".{PREPARED_FILE}.part"
-    part.write_text(text, encoding="utf-8")
-    part.replace(plan.out / PREPARED_FILE)
+    with replacing(plan.out / PREPARED_FILE) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def _read_state(folder: Path) -> dict[str, Any]:

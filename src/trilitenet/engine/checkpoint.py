@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 import pickle
 import random
-import tempfile
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import torch
 
-from trilitenet.errors import OutputError, WeightsError
+from trilitenet.errors import OutputError, WeightsError, replacing
 
 __all__ = ["CHECKPOINT_SCHEMA", "random_state", "read_checkpoint", "set_random_state", "write_checkpoint"]
 
@@ -44,19 +43,13 @@ def write_checkpoint(path: str | Path, state: dict[str, Any]) -> None:
         OutputError: If it cannot be written.
     """
     path = Path(path)
-    temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-        with os.fdopen(handle, "wb") as file:
+        with replacing(path) as part, part.open("wb") as file:
             torch.save({"schema": CHECKPOINT_SCHEMA, **state}, file)
             file.flush()
             os.fsync(file.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
     except (OSError, RuntimeError) as error:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
         raise OutputError(f"{path}: cannot write the checkpoint ({error})") from error
 
 

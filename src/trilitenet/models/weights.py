@@ -10,7 +10,6 @@ import hashlib
 import os
 import pickle
 import re
-import tempfile
 import warnings
 import zipfile
 from collections.abc import Mapping
@@ -23,7 +22,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from trilitenet.config import STRIDES, VARIANTS, Anchors, ModelCard, get_variant
-from trilitenet.errors import OutputError, WeightsError
+from trilitenet.errors import OutputError, WeightsError, replacing
 from trilitenet.models.trilitenet import TriLiteNet, build_network
 
 __all__ = [
@@ -130,17 +129,11 @@ def save_network(network: TriLiteNet, path: str | os.PathLike[str], card: ModelC
             continue
         data = tensor.detach().to("cpu").contiguous()
         tensors[name] = data.half() if half and data.is_floating_point() else data.clone()
-    temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-        os.close(handle)
-        save_file(tensors, temporary, metadata={CARD_KEY: card.to_json(), "format": "pt"})
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
+        with replacing(path) as part:
+            save_file(tensors, part, metadata={CARD_KEY: card.to_json(), "format": "pt"})
     except (OSError, SafetensorError) as error:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
         raise OutputError(f"{path}: cannot write the weights ({error})") from error
 
 

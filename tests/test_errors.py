@@ -1,0 +1,33 @@
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+import pytest
+
+from trilitenet.errors import OutputError, replacing, writing
+
+
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with replacing(path) as part:
+        part.write_text("new")
+        assert path.read_text() == "old"
+    assert path.read_text() == "new"
+    assert path.stat().st_mode & 0o777 == 0o644
+    for error in (KeyboardInterrupt, OSError(errno.ENOSPC, "No space left on device")):
+        with pytest.raises((KeyboardInterrupt, OSError)), replacing(path) as part:
+            part.write_text("ne")
+            raise error
+        assert path.read_text() == "new"
+        assert list(tmp_path.iterdir()) == [path]
+
+
+def test_writing_tells_the_cause_in_one_line(tmp_path: Path) -> None:
+    with (
+        pytest.raises(OutputError, match=r"absent/\.a\.txt.*: cannot be written \(No such file"),
+        writing("x"),
+        replacing(tmp_path / "absent" / "a.txt"),
+    ):
+        pass
