@@ -16,12 +16,14 @@ from tests.artefacts import Artefacts
 from trilitenet.commands import export as command
 from trilitenet.commands.export import export
 from trilitenet.config import TASKS
+from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.synthetic_files import write_dataset
 from trilitenet.deploy.parity import TOLERANCES, Tolerance
 from trilitenet.engine.evaluate import evaluate
 from trilitenet.engine.figures import FIGURES
 from trilitenet.engine.report import Figure, Report
 from trilitenet.errors import BackendError, ConfigError, OutputError
+from trilitenet.inference.onnx_backend import OnnxBackend
 from trilitenet.inference.predictor import Predictor
 from trilitenet.models.trilitenet import build_network
 from trilitenet.models.weights import load_network, save_network
@@ -229,6 +231,18 @@ def test_int8(
     text = path.read_bytes()
     assert (b"FakeQuantize" if format_ == "openvino" else b"QuantizeLinear") in text
     assert "in floating point: difference, detection, c4, c5" in done.summary()
+    with trilitenet.load(path, threads=1) as predictor:  # on the runtime that it was quantised for and compared on
+        assert predictor.backend.name == f"{'openvino' if format_ == 'openvino' else 'onnxruntime'} cpu int8"
+    if format_ == "onnx":
+        with pytest.raises(BackendError, match="use backend='onnxruntime'"):
+            trilitenet.load(path, backend="openvino")
+
+
+def test_the_drop_is_measured_all_over_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_dataset(tmp_path, "val", 7, 0, size=(32, 64))
+    monkeypatch.setattr(command, "DROP_FRAMES", 3)
+    names = DrivingDataset(tmp_path, "val").names
+    assert command.drop_frames(tmp_path).names == [names[0], names[3], names[6]]
 
 
 def test_the_drop_is_that_of_the_worst_of_all_tasks(
@@ -251,10 +265,10 @@ def test_the_drop_is_that_of_the_worst_of_all_tasks(
 
     monkeypatch.setattr(command, "evaluate", worse)
     path = export(str(artefacts.folder / "weights.safetensors"), output=tmp_path / "a.onnx", size="96x160").path
-    assert command._measure_drop(network, path, tmp_path / "data") == pytest.approx(2.0)
+    assert command._measure_drop(network, OnnxBackend(path), tmp_path / "data") == pytest.approx(2.0)
     assert canvases == [(96, 160), (96, 160)]
     monkeypatch.undo()
     for labels in ("det_annotations", "da_seg_annotations", "ll_seg_annotations"):
         shutil.rmtree(tmp_path / "data" / labels)
     with pytest.raises(ConfigError, match="--max-drop needs labels"):
-        command._measure_drop(network, path, tmp_path / "data")
+        command._measure_drop(network, OnnxBackend(path), tmp_path / "data")

@@ -10,11 +10,11 @@ from typing import Final, Literal
 
 from trilitenet.commands.evaluate import evaluate, hash_dataset, hash_model
 from trilitenet.commands.export import (
-    DROP_FRAMES,
     PRECISIONS,
     SUFFIXES,
     Precision,
     check_writable,
+    drop_frames,
     export,
     find_pictures,
 )
@@ -209,7 +209,7 @@ def _hash_calibration(calibration: Path, frames: int, max_drop: float | None) ->
     frames_hash = hash_files(find_pictures(calibration, frames, "train"))
     if max_drop is None:
         return frames_hash
-    measured = hash_dataset(DrivingDataset(calibration, "val"), DROP_FRAMES)
+    measured = hash_dataset(drop_frames(calibration))
     return hashlib.sha256("\n".join((frames_hash, *measured.values())).encode()).hexdigest()
 
 

@@ -10,7 +10,7 @@ import re
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -46,12 +46,14 @@ __all__ = [
     "Exported",
     "Precision",
     "check_writable",
+    "drop_frames",
     "export",
     "find_pictures",
 ]
 
 Format = Literal["onnx", "openvino", "ncnn", "tensorrt", "torch", "triton"]
 Precision = Literal["fp32", "fp16", "bf16", "int8"]
+_Item = TypeVar("_Item")
 
 SUFFIXES = {
     "onnx": ".onnx",
@@ -71,7 +73,7 @@ PRECISIONS = {
 }
 """Precisions of a format."""
 DROP_FRAMES: Final = 150
-"""The drop of INT8 is measured on the first so many images of the val split."""
+"""The drop of INT8 is measured on at most so many images, spread evenly over the val split."""
 DROP_SCORES: Final[dict[Task, str]] = {
     "detection": "fair/detection/ap50",
     "drivable": "fair/drivable/miou",
@@ -259,7 +261,7 @@ def export(
         with tempfile.TemporaryDirectory() as folder:
             trial = Path(folder) / path.name
             _write(candidate, trial, network, info)
-            drop = 0.0 if max_drop is None else _measure_drop(network, trial, calibration)
+            drop = 0.0 if max_drop is None else _measure_drop(network, _open(trial, info), calibration)
         if max_drop is None or drop <= max_drop:
             exported = _keep(network, candidate, info, path, checks)
             kept = f"in floating point: {', '.join(keep) or 'attention and depthwise convolutions only'}"
@@ -342,8 +344,18 @@ def find_pictures(source: Path, count: int, split: str) -> list[Path]:
     paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _IMAGES)
     if not paths:
         raise InputError(f"{source}: no pictures there")
-    chosen = np.linspace(0, len(paths) - 1, min(count, len(paths))).round().astype(int)
-    return [paths[index] for index in chosen]
+    return _spread(paths, count)
+
+
+def drop_frames(data: Path, class_names: Sequence[str] | None = None) -> DrivingDataset:
+    """Return what the drop of INT8 is measured on: at most `DROP_FRAMES` images, from all over the val split."""
+    dataset = DrivingDataset(data, "val", class_names=class_names)
+    return DrivingDataset(data, "val", class_names=class_names, names=_spread(dataset.names, DROP_FRAMES))
+
+
+def _spread(items: Sequence[_Item], count: int) -> list[_Item]:
+    chosen = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[index] for index in chosen]
 
 
 def _as_input(canvas: NDArray[np.uint8], info: ArtefactInfo) -> NDArray[Any]:
@@ -444,16 +456,14 @@ def _require(parity: Parity, path: Path) -> None:
         raise BackendError(f"{path}: not written, it differs from the network: {'; '.join(parity.failures)}")
 
 
-def _measure_drop(network: TriLiteNet, artefact: Path, data: Path) -> float:
+def _measure_drop(network: TriLiteNet, backend: Backend, data: Path) -> float:
     """Return the largest loss of a score in points on the val split, against the float32 network."""
-    from trilitenet.commands.load import load
-
     if not (data / "images" / "val").is_dir():
         raise ConfigError(f"--max-drop needs labels; {data} is not a data set with a val split")
-    dataset = DrivingDataset(data, "val", class_names=network.card.class_names)
+    dataset = drop_frames(data, network.card.class_names)
 
     def scores(predictor: Predictor) -> dict[str, float]:
-        report = evaluate(predictor, dataset, limit=DROP_FRAMES, resamples=0, worst=0, by=())
+        report = evaluate(predictor, dataset, resamples=0, worst=0, by=())
         values = {
             key: report.figures[key].value
             for task in network.card.tasks
@@ -461,7 +471,7 @@ def _measure_drop(network: TriLiteNet, artefact: Path, data: Path) -> float:
         }
         return {key: value for key, value in values.items() if math.isfinite(value)}
 
-    with load(artefact) as predictor:
+    with Predictor(backend) as predictor:
         before = scores(Predictor(TorchBackend(network, "cpu", predictor.backend.canvas)))  # the same pixels for both
         if not before:
             raise ConfigError(f"--max-drop needs labels; there are none for {', '.join(network.card.tasks)} in {data}")

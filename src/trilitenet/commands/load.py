@@ -11,6 +11,7 @@ from typing import Final
 from trilitenet.config import VARIANTS, ArtefactInfo, ModelCard, Thresholds
 from trilitenet.errors import ConfigError, did_you_mean
 from trilitenet.inference.backend import Backend
+from trilitenet.inference.exported import is_int8_onnx
 from trilitenet.inference.predictor import Predictor
 
 __all__ = ["BACKENDS", "load"]
@@ -88,7 +89,7 @@ def _open(model: str | os.PathLike[str], device: str, backend: str, streams: int
     if backend == "auto":
         # OpenVINO was the faster of the two on every processor measured (docs/speed.md); it has no CUDA.
         usable = [name for name in runs if importlib.util.find_spec(name) is not None]
-        if device.startswith("cuda") and "onnxruntime" in usable:
+        if "onnxruntime" in usable and (device.startswith("cuda") or is_int8_onnx(model)):
             usable = ["onnxruntime"]
         backend = (usable or runs)[0]
     elif backend not in runs:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +15,9 @@ from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
 from trilitenet.errors import ShapeError, WeightsError
 from trilitenet.structures import RawOutputs
 
-__all__ = ["prepare_input", "read_metadata", "run_images"]
+__all__ = ["is_int8_onnx", "prepare_input", "read_metadata", "run_images"]
+
+_METADATA_BYTES = 1 << 16
 
 
 def read_metadata(metadata: Mapping[str, str], source: str) -> tuple[ModelCard, ArtefactInfo]:
@@ -29,6 +34,22 @@ def read_metadata(metadata: Mapping[str, str], source: str) -> tuple[ModelCard, 
         if key not in metadata:
             raise WeightsError(f"{source}: no {key!r} in its metadata; export it with: trilitenet export")
     return ModelCard.from_json(metadata[CARD_KEY], source), ArtefactInfo.from_json(metadata[ARTEFACT_KEY], source)
+
+
+def is_int8_onnx(path: str | os.PathLike[str]) -> bool:
+    """Whether an ``.onnx`` artefact is quantised, without a runtime: its description stands as text after the graph.
+
+    Args:
+        path: The file; one that cannot be read is not quantised.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - _METADATA_BYTES))
+            end = file.read()
+    except OSError:
+        return False
+    start = end.rfind(ARTEFACT_KEY.encode())
+    return start >= 0 and re.search(rb'"precision":\s*"int8"', end[start:]) is not None
 
 
 def prepare_input(image: NDArray[np.uint8], info: ArtefactInfo) -> NDArray[Any]:
