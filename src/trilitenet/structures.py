@@ -16,6 +16,9 @@ SCHEMA_VERSION: Final = "1.0"
 """Version of the JSON that `Perception.to_dict` returns: the major number rises when a reader would break."""
 
 
+_BOX_ARRAYS: Final = {"xyxy": np.float32, "confidence": np.float32, "class_id": np.int64, "track_id": np.int64}
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Boxes:
     """Detected objects of one image.
@@ -27,7 +30,7 @@ class Boxes:
         track_id: (N,) int64, the object's identity over the frames of a video, -1 where unknown; None without tracking.
 
     Raises:
-        ShapeError: If the arrays do not fit each other.
+        ShapeError: If the arrays do not fit each other, or are no such arrays.
     """
 
     xyxy: NDArray[np.float32]
@@ -36,7 +39,14 @@ class Boxes:
     track_id: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
-        count = len(self.xyxy)
+        for name, dtype in _BOX_ARRAYS.items():
+            value = getattr(self, name)
+            if value is not None:
+                try:
+                    object.__setattr__(self, name, np.asarray(value, dtype))
+                except (OverflowError, TypeError, ValueError) as error:
+                    raise ShapeError(f"{name} must be an array of {dtype.__name__} ({error})") from error
+        count = len(self.xyxy) if self.xyxy.ndim else 0
         if self.xyxy.shape != (count, 4):
             raise ShapeError(f"xyxy must be (N, 4), got {self.xyxy.shape}")
         for name in ("confidence", "class_id", "track_id"):
@@ -121,8 +131,10 @@ class Perception:
                 raise ShapeError(f"{name} must be {self.size} bool, got {mask.shape} {mask.dtype}")
         if self.image is not None and self.image.shape != (*self.size, 3):
             raise ShapeError(f"image must be {(*self.size, 3)}, got {self.image.shape}")
-        if self.boxes is not None and len(self.boxes) and self.boxes.class_id.max() >= len(self.class_names):
-            raise ShapeError(f"class id {int(self.boxes.class_id.max())} has no name among {self.class_names}")
+        if self.boxes is not None and len(self.boxes):
+            for class_id in (int(self.boxes.class_id.min()), int(self.boxes.class_id.max())):
+                if not 0 <= class_id < len(self.class_names):
+                    raise ShapeError(f"class id {class_id} has no name among {self.class_names}")
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``json.dumps`` takes: the documented, versioned JSON form (masks as COCO run-length)."""

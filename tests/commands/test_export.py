@@ -238,6 +238,17 @@ def test_int8(
             trilitenet.load(path, backend="openvino")
 
 
+def test_suppression_inside_is_not_overridden_silently(artefacts: Artefacts, tmp_path: Path) -> None:
+    path = export(
+        str(artefacts.folder / "weights.safetensors"), output=tmp_path / "a.onnx", size="64x128", nms=True
+    ).path
+    inside = trilitenet.load(path).thresholds
+    assert trilitenet.load(path, confidence=0.9, iou=0.1).thresholds.confidence == 0.9
+    for change in ({"confidence": inside.confidence / 2}, {"iou": 0.99}):
+        with pytest.raises(ConfigError, match="export it without --nms"):
+            trilitenet.load(path, **change)  # type: ignore[arg-type]
+
+
 def test_the_drop_is_measured_all_over_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_dataset(tmp_path, "val", 7, 0, size=(32, 64))
     monkeypatch.setattr(command, "DROP_FRAMES", 3)

@@ -8,12 +8,15 @@ import pytest
 from tests.artefacts import SIZE, Artefacts
 from tests.deploy.networks import lively_network
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, Thresholds
+from trilitenet.deploy import onnx as deploy_onnx
 from trilitenet.deploy.graph import DeployGraph
 from trilitenet.deploy.layouts import LAYOUTS, pick_layout
 from trilitenet.deploy.onnx import PORTABLE_OPERATORS, build_onnx, save_onnx
 from trilitenet.deploy.quantize import KEEP_STEPS, kept_nodes
 from trilitenet.deploy.tensorrt import trtexec_line
 from trilitenet.errors import ConfigError
+from trilitenet.processing.boxes import cxcywh_to_xyxy
+from trilitenet.processing.nms import nms
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxscript")
@@ -104,3 +107,30 @@ def test_kept_nodes_follow_modules() -> None:
 def test_trtexec_line() -> None:
     line = trtexec_line(Path("a b.onnx"), Path("a.plan"), "fp16")
     assert line == "trtexec '--onnx=a b.onnx' --saveEngine=a.plan --fp16 --useCudaGraph"
+
+
+@pytest.mark.parametrize(("classes", "most"), [(1, 300), (80, 300), (80, 25)])
+def test_suppression_inside_is_exact_for_any_number_of_classes(classes: int, most: int) -> None:
+    import onnxruntime
+
+    rng = np.random.default_rng(5)
+    rows = np.zeros((1, 300, 5 + classes), np.float32)
+    rows[0, :, :2], rows[0, :, 2:4] = rng.uniform(0, 60, (300, 2)), rng.uniform(5, 15, (300, 2))
+    rows[0, :, 4] = rng.uniform(0.3, 1, 300)
+    rows[0, :, 5:] = rng.uniform(0, 0.2, (300, classes))
+    rows[0, np.arange(300), 5 + rng.choice([0, classes - 1], 300)] = 0.9
+    helper = onnx.helper
+    value = {name: helper.make_tensor_value_info(name, 1, list(rows.shape)) for name in ("rows", "detection")}
+    graph = helper.make_graph(
+        [helper.make_node("Identity", ["rows"], ["detection"])], "g", [value["rows"]], [value["detection"]]
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    thresholds = Thresholds(confidence=0.4, iou=0.4, max_boxes=most)
+    deploy_onnx._append_nms(onnx, model, classes, thresholds)
+    onnx.checker.check_model(model, full_check=True)
+    (inside,) = onnxruntime.InferenceSession(model.SerializeToString()).run(None, {"rows": rows})
+    confidence, class_id = rows[0, :, 4] * rows[0, :, 5:].max(1), rows[0, :, 5:].argmax(1)
+    likely = (confidence > 0.4).nonzero()[0]
+    boxes = cxcywh_to_xyxy(rows[0, likely, :4])
+    outside = likely[nms(boxes, confidence[likely], class_id[likely], 0.4, most)]
+    np.testing.assert_array_equal(inside[0], rows[0, outside])

@@ -110,3 +110,9 @@ def test_what_is_no_image_is_refused(image: Any) -> None:
 def test_a_path_that_cannot_be_is_no_file() -> None:
     with pytest.raises(InputError, match="no such file"):
         read_image("a\0b")
+
+
+def test_dark_16_bit_grey_stays_dark() -> None:
+    dark = np.full((4, 6), 200, np.uint16)
+    dark[0, 0] = 255
+    np.testing.assert_array_equal(read_image(encoded(Image.fromarray(dark), "PNG"))[1:], 1)

@@ -43,3 +43,17 @@ def test_agrees_with_the_definition_on_random_boxes(count: int, class_count: int
     for i in range(count):
         better = [k for k in kept if scores[k] > scores[i] and classes[k] == classes[i]]
         assert (i in kept) == (not better or overlap[i, better].max() <= 0.45)
+
+
+def test_boxes_outside_the_image_meet_their_own_class_alone() -> None:
+    scores = np.array([0.9, 0.8], np.float32)
+    left = np.array([[0, 0, 10, 10], [-11, -11, -1, -1]], np.float32)
+    assert nms(left, scores, np.array([0, 1]), 0.5, 300).tolist() == [0, 1]
+    large = np.array([[0, 0, 640, 384], [-600, -400, 600, 400]], np.float32)
+    assert nms(large, scores, np.array([0, 1]), 0.05, 300).tolist() == [0, 1]
+
+
+def test_empty_boxes_overlap_nothing() -> None:
+    boxes = np.array([[0, 0, 0, 0], [0, 0, 9, 9], [50, 50, 50, 50], [0, 0, 9, 8]], np.float32)
+    scores = np.array([0.9, 0.8, 0.7, 0.6], np.float32)
+    assert nms(boxes, scores, np.zeros(4, np.int64), 0.5, 300).tolist() == [0, 1, 2]

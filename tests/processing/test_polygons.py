@@ -36,3 +36,16 @@ def test_specks_go_and_the_largest_comes_first() -> None:
 def test_nothing_gives_nothing() -> None:
     assert mask_to_polygons(np.zeros((8, 8), np.bool_)) == []
     assert not polygons_to_mask([], (8, 8)).any()
+
+
+def test_thin_regions_stay() -> None:
+    for top, bottom, left, right in ((30, 32, 20, 180), (30, 31, 20, 180), (9, 60, 7, 8)):
+        mask = np.zeros((60, 200), np.bool_)
+        mask[top:bottom, left:right] = True
+        (polygon,) = mask_to_polygons(mask)
+        assert len(polygon) >= 3
+        np.testing.assert_array_equal(polygons_to_mask([polygon], mask.shape), mask)
+    slanted = np.zeros((200, 200), np.uint8)
+    cv2.line(slanted, (20, 20), (180, 100), 1)
+    (polygon,) = mask_to_polygons(slanted)
+    assert len(polygon) >= 3

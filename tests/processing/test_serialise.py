@@ -59,6 +59,20 @@ def test_masks_are_what_coco_tools_read() -> None:
         np.testing.assert_array_equal(decode_mask(encoded), mask)
 
 
+def test_what_coco_tools_wrote_is_read() -> None:
+    mask = np.eye(5, 7, dtype=np.bool_)
+    encoded = coco_mask.encode(np.asfortranarray(mask.astype(np.uint8)))
+    np.testing.assert_array_equal(decode_mask(encoded), mask)
+
+
+def test_boxes_take_lists_and_refuse_what_is_no_array() -> None:
+    boxes = Boxes([[1, 2, 3, 4]], [0.5], [0])  # type: ignore[arg-type]
+    assert [str(array.dtype) for array in (boxes.xyxy, boxes.confidence, boxes.class_id)] == ["float32"] * 2 + ["int64"]
+    for broken in ([[1, 2, 3, 4], [1]], "x", 3.0):
+        with pytest.raises(ShapeError, match="xyxy must be"):
+            Boxes(broken, [0.5], [0])  # type: ignore[arg-type]
+
+
 def test_an_absent_task_is_null_and_an_empty_one_is_empty() -> None:
     absent = Perception(size=(4, 4)).to_dict()
     assert absent["boxes"] is absent["drivable"] is absent["lane"] is None
@@ -82,6 +96,13 @@ def test_an_absent_task_is_null_and_an_empty_one_is_empty() -> None:
         {"lane": {"size": [40, 60], "counts": "ooooooooooooooo0"}},
         {"lane": {"size": [-40, -60], "counts": "PPn0"}},
         {"class_names": ["car"]},
+        {"class_names": "vehicle"},
+        {"size": {"height": float("inf"), "width": 4}},
+        {"size": {"height": -5, "width": 7}, "boxes": None, "drivable": None, "lane": None},
+        {"timestamp": "soon"},
+        {"boxes": [{"xyxy": [1, 2, 3, 4], "confidence": 0.5, "class_id": -1}]},
+        {"boxes": [{"xyxy": [1, 2, 3, 4], "confidence": 0.5, "class_id": 10**30}]},
+        {"lane": {"size": [40, 60], "counts": [2400]}},
     ],
 )
 def test_what_is_not_that_form_is_refused(change: dict[str, Any]) -> None:

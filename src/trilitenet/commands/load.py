@@ -77,6 +77,12 @@ def load(
             "for others export it with --masks probability"
         )
     thresholds = _override(runtime.card, confidence=confidence, iou=iou, drivable=drivable, lane=lane)
+    inside = runtime.card.thresholds
+    if info is not None and info.nms and (thresholds.confidence < inside.confidence or thresholds.iou > inside.iou):
+        raise ConfigError(
+            f"{model} suppresses boxes inside, at confidence {inside.confidence:g} and IoU {inside.iou:g}; "
+            "for a lower confidence or a higher IoU export it without --nms"
+        )
     return Predictor(runtime, thresholds, long_side=long_side, batch_size=batch_size)
 
 

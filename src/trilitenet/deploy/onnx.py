@@ -144,10 +144,10 @@ def _name_nodes(model: Any) -> None:
 
 
 def _append_nms(onnx: Any, model: Any, classes: int, thresholds: Thresholds) -> None:
-    """Append suppression: detection becomes (1, kept, 5 + classes), best first within ONNX's own order.
+    """Append suppression: detection becomes (1, kept, 5 + classes), best first.
 
-    As after the graph, a box has one class, its most probable, and meets only boxes of that class: each class is
-    moved to a place of its own, ``class x 65536`` pixels to the right, so that one pass serves all.
+    As after the graph, a box has one class, its most probable, and meets only boxes of that class: its confidence
+    stands in the row of that class alone. Of all classes together the best ``max_boxes`` are kept.
     """
     helper, numpy_helper, graph = onnx.helper, onnx.numpy_helper, model.graph
     for node in graph.node:
@@ -172,26 +172,37 @@ def _append_nms(onnx: Any, model: Any, classes: int, thresholds: Thresholds) -> 
         add("Slice", ["detection_all", *ends, axis], [name])
         return name
 
-    xy, wh = cut("nms_xy", 0, 2), cut("nms_wh", 2, 4)
+    boxes = cut("nms_boxes", 0, 4)
     objectness, scores = cut("nms_objectness", 4, 5), cut("nms_classes", 5, 5 + classes)
     add("ReduceMax", [scores, axis], ["nms_best"], keepdims=1)
-    add("ArgMax", [scores], ["nms_class"], axis=2, keepdims=1)
-    add("Cast", ["nms_class"], ["nms_class_float"], to=onnx.TensorProto.FLOAT)
-    add("Mul", ["nms_class_float", const("apart", np.array(65536, np.float32))], ["nms_place"])
-    add("Add", [xy, "nms_place"], ["nms_placed"])
-    add("Concat", ["nms_placed", wh], ["nms_boxes"], axis=2)
     add("Mul", [objectness, "nms_best"], ["nms_confidence"])
-    add("Transpose", ["nms_confidence"], ["nms_scores"], perm=[0, 2, 1])
+    rows = "nms_confidence"
+    if classes > 1:
+        rows = "nms_rows"
+        add("ArgMax", [scores], ["nms_class"], axis=2, keepdims=1)
+        add("Equal", ["nms_class", const("ids", np.arange(classes).reshape(1, 1, -1))], ["nms_own"])
+        add("Where", ["nms_own", "nms_confidence", const("none", np.array(0, np.float32))], [rows])
+    add("Transpose", [rows], ["nms_scores"], perm=[0, 2, 1])
     limits = [
         const("max", np.array([thresholds.max_boxes], np.int64)),
         const("iou", np.array([thresholds.iou], np.float32)),
         const("score", np.array([thresholds.confidence], np.float32)),
     ]
-    add("NonMaxSuppression", ["nms_boxes", "nms_scores", *limits], ["nms_selected"], center_point_box=1)
+    add("NonMaxSuppression", [boxes, "nms_scores", *limits], ["nms_selected"], center_point_box=1)
     add("Slice", ["nms_selected", const("two", np.array([2], np.int64)), const("three", np.array([3], np.int64)),
                   const("one", np.array([1], np.int64))], ["nms_column"])  # fmt: skip
-    add("Reshape", ["nms_column", const("flat", np.array([-1], np.int64))], ["nms_index"])
-    add("Gather", ["detection_all", "nms_index"], ["detection"], axis=1)
+    flat = const("flat", np.array([-1], np.int64))
+    add("Reshape", ["nms_column", flat], ["nms_index"])
+    chosen = "nms_index"
+    if classes > 1:  # each class has up to max_boxes, one class after the other
+        chosen = "nms_ranked"
+        add("Reshape", ["nms_confidence", flat], ["nms_all"])
+        add("Gather", ["nms_all", "nms_index"], ["nms_kept"], axis=0)
+        add("Shape", ["nms_kept"], ["nms_count"])
+        add("Min", ["nms_count", limits[0]], ["nms_k"])
+        add("TopK", ["nms_kept", "nms_k"], ["nms_values", "nms_order"], axis=0)
+        add("Gather", ["nms_index", "nms_order"], [chosen], axis=0)
+    add("Gather", ["detection_all", chosen], ["detection"], axis=1)
     for output in graph.output:
         if output.name == "detection":
             shape = [1, "kept", 5 + classes]

@@ -97,18 +97,18 @@ def _decode(image: Image.Image, name: str) -> NDArray[np.uint8]:
         if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:  # asked first, because both calls always copy
             image = ImageOps.exif_transpose(image)
         if image.mode in {"I", "F"} or image.mode.startswith("I;16"):
-            return _scale_deep(np.asarray(image), name)
+            return _scale_deep(np.asarray(image), name, deep=image.mode.startswith("I;16"))
         return np.array(image if image.mode == "RGB" else image.convert("RGB"), np.uint8)
     except _BROKEN as error:
         raise InputError(f"{name}: is broken or truncated ({_reason(error)})") from error
 
 
-def _scale_deep(grey: NDArray[Any], name: str) -> NDArray[np.uint8]:
-    """Scale (height, width) grey of 16 or 32 bit to 8 bit: from 0 .. 65535 if it exceeds 255 anywhere."""
+def _scale_deep(grey: NDArray[Any], name: str, *, deep: bool) -> NDArray[np.uint8]:
+    """Scale (height, width) grey to 8 bit: from 0 .. 65535 if it is ``deep`` (16 bit) or exceeds 255 anywhere."""
     values = grey.astype(np.float32)
     if not np.isfinite(values).all() or (grey.dtype.kind == "f" and values.size and values.max() <= 1.0):
         raise InputError(f"{name}: holds fractions or no numbers; scale it to 0 .. 255 or 0 .. 65535")
-    if values.size and values.max() > 255:
+    if deep or (values.size and values.max() > 255):
         values /= 257.0
     return to_rgb(np.clip(np.rint(values), 0, 255).astype(np.uint8))
 

@@ -53,7 +53,12 @@ def _greedy(boxes: NDArray[np.float64], classes: NDArray[np.int32], iou: float) 
     """Return the positions that stay, of boxes sorted best first."""
     if not len(boxes):
         return np.zeros(0, np.int64)
-    rectangles = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
+    empty = (boxes[:, 2:] <= boxes[:, :2]).any(axis=1)
+    if empty.any():  # they overlap nothing, but for OpenCV two of them are the same
+        full = (~empty).nonzero()[0]
+        return np.sort(np.concatenate([empty.nonzero()[0], full[_greedy(boxes[full], classes[full], iou)]]))
+    # OpenCV moves the boxes of a class to a place of its own, which takes coordinates from 0 on.
+    rectangles = np.concatenate([boxes[:, :2] - boxes[:, :2].min(), boxes[:, 2:] - boxes[:, :2]], axis=1)
     rank = np.arange(len(boxes), 0, -1, dtype=np.float32)  # in place of the scores, to keep the order of equal ones
     if (classes == classes[0]).all():
         stays = cv2.dnn.NMSBoxes(rectangles, rank, 0.0, iou)  # type: ignore[arg-type]

@@ -32,8 +32,9 @@ def mask_to_polygons(
         if area < min_area:
             continue
         points = cv2.approxPolyDP(contour, tolerance, closed=True)[:, 0]
-        if len(points) >= 3:
-            polygons.append((area, points.astype(np.float32)))
+        if len(points) < 3:  # a thin region, there and back on one line
+            points = contour[:, 0] if len(contour) > 2 else np.resize(contour[:, 0], (4, 2))
+        polygons.append((area, points.astype(np.float32)))
     polygons.sort(key=lambda pair: -pair[0])
     return [points for _, points in polygons]
 

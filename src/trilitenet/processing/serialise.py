@@ -30,10 +30,11 @@ def decode_mask(encoded: dict[str, Any]) -> NDArray[np.bool_]:
     """
     try:
         height, width = (int(side) for side in encoded["size"])
-        runs = _read_runs(encoded["counts"])
+        counts = encoded["counts"]
+        runs = _read_runs(counts.decode("ascii") if isinstance(counts, bytes) else counts)  # pycocotools gives bytes
         if min(height, width) < 0 or (runs < 0).any() or runs.sum() != height * width:
             raise ValueError(f"the runs do not fill {width}x{height} pixels")
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise ShapeError(f"a mask must be {{'size': [height, width], 'counts': run-length text}} ({error})") from error
     values = np.arange(len(runs)) % 2 == 1
     return np.ascontiguousarray(np.repeat(values, runs).reshape(width, height).T)
@@ -90,17 +91,25 @@ def perception_from_dict(mapping: dict[str, Any]) -> Perception:
         if int(version.partition(".")[0]) > int(SCHEMA_VERSION.partition(".")[0]):
             raise ShapeError(f"schema {version} is newer than {SCHEMA_VERSION}, which this version reads; upgrade")
         boxes, drivable, lane = (mapping.get(name) for name in ("boxes", "drivable", "lane"))
+        size = (int(mapping["size"]["height"]), int(mapping["size"]["width"]))
+        names, timestamp = mapping["class_names"], mapping.get("timestamp")
+        if min(size) < 1:
+            raise ShapeError(f"size must be at least 1x1, got {size[1]}x{size[0]}")
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ShapeError(f"class_names must be a list of texts, got {names!r}")
+        if timestamp is not None and not isinstance(timestamp, (int, float)):
+            raise ShapeError(f"timestamp must be seconds or null, got {timestamp!r}")
         return Perception(
-            size=(int(mapping["size"]["height"]), int(mapping["size"]["width"])),
-            class_names=tuple(mapping["class_names"]),
+            size=size,
+            class_names=tuple(names),
             boxes=None if boxes is None else _boxes_from_list(boxes),
             drivable=None if drivable is None else decode_mask(drivable),
             lane=None if lane is None else decode_mask(lane),
             source=mapping.get("source"),
             frame=mapping.get("frame"),
-            timestamp=mapping.get("timestamp"),
+            timestamp=timestamp,
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         if isinstance(error, ShapeError):
             raise
         raise ShapeError(f"not the JSON form of a perception: {type(error).__name__}: {error}") from error
