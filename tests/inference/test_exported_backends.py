@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 import subprocess
@@ -113,6 +114,20 @@ def test_wrong_size_is_refused(artefacts: Artefacts, kind: Any) -> None:
         backend.run(np.zeros((1, 96, 128, 3), np.uint8))
     with pytest.raises(ShapeError, match="uint8"):
         backend.run(np.zeros((1, 64, 128, 3), np.float32))
+
+
+@pytest.mark.parametrize("kind", [OnnxBackend, OpenVINOBackend])
+def test_what_a_runtime_cannot_take_is_one_line(artefacts: Artefacts, kind: Any) -> None:
+    backend = kind(artefacts.folder / "model.onnx")
+    with pytest.raises(ShapeError, match="B >= 1"):
+        backend.run(np.zeros((0, *SIZE, 3), np.uint8))
+    backend.info = dataclasses.replace(backend.info, size=None)  # it says it is dynamic, and is not
+    with pytest.raises(ShapeError, match="multiples of 32 pixels, got 64x50"):
+        backend.run(np.zeros((1, 50, 64, 3), np.uint8))
+    with pytest.raises(BackendError, match="the runtime failed") as caught:
+        backend.run(np.zeros((1, 96, 96, 3), np.uint8))
+    assert "\n" not in str(caught.value)
+    backend.run(np.zeros((1, *SIZE, 3), np.uint8))
 
 
 @pytest.mark.parametrize(
