@@ -84,6 +84,27 @@ def test_in_parallel_gives_the_same(artefacts: Artefacts, name: str, kind: Any) 
             assert np.mean(got.lane == one.lane) > 0.999
 
 
+@pytest.mark.parametrize(
+    ("name", "kind", "held"), [("model.onnx", OnnxBackend, "_session"), ("model.xml", OpenVINOBackend, "_idle")]
+)
+def test_two_uses_in_parallel_share_and_the_last_one_restores(
+    artefacts: Artefacts, name: str, kind: Any, held: str
+) -> None:
+    backend = kind(artefacts.folder / name, threads=2)
+    before = getattr(backend, held)
+    for _ in range(2):
+        first, second = backend.in_parallel(), backend.in_parallel()
+        assert first.__enter__() == 2
+        shared = getattr(backend, held)
+        assert shared is not before
+        assert second.__enter__() == 2
+        assert getattr(backend, held) is shared
+        first.__exit__(None, None, None)
+        assert getattr(backend, held) is shared
+        second.__exit__(None, None, None)
+        assert getattr(backend, held) is before
+
+
 def test_the_first_two_images_of_a_process_may_come_at_once(artefacts: Artefacts) -> None:
     program = f"""
 import threading, numpy as np

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ModelCard
 from trilitenet.errors import BackendError, ConfigError, WeightsError, import_extra
-from trilitenet.inference.backend import MOST_PARALLEL
+from trilitenet.inference.backend import MOST_PARALLEL, replaced
 from trilitenet.inference.exported import prepare_input, read_metadata, run_images
 from trilitenet.processing.cores import usable_cores
 from trilitenet.structures import RawOutputs
@@ -170,11 +170,8 @@ class OpenVINOBackend:
         if count <= self.streams:
             yield self.streams
             return
-        before, self._idle = self._idle, _requests(self._compile(count), count)
-        try:
+        with replaced(self, "_idle", lambda: _requests(self._compile(count), count)):
             yield count
-        finally:
-            self._idle = before
 
     def close(self) -> None:
         """Free the compiled model's requests."""
