@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import pickle
 import shutil
 import subprocess
 import sys
@@ -119,6 +120,22 @@ threads = [threading.Thread(target=work) for _ in range(2)]
 [thread.join() for thread in threads]
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("model.onnx", OnnxBackend), ("model.xml", OpenVINOBackend), ("model.ncnn.param", NcnnBackend)],
+)
+def test_a_predictor_goes_to_other_processes(artefacts: Artefacts, name: str, kind: Any) -> None:
+    if kind is NcnnBackend:
+        pytest.importorskip("pnnx")
+        pytest.importorskip("ncnn")
+    predictor = trilitenet.Predictor(kind(artefacts.folder / name, threads=1), batch_size=3)
+    copy = pickle.loads(pickle.dumps(predictor))  # noqa: S301 - its own
+    assert (copy.backend.name, copy.batch_size) == (predictor.backend.name, 3)
+    for one, other in zip(predictor([*artefacts.images]), copy([*artefacts.images]), strict=True):
+        assert one.lane is not None
+        np.testing.assert_array_equal(other.lane, one.lane)
 
 
 def test_a_closed_model_says_so(artefacts: Artefacts) -> None:

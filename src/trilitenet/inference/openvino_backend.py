@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import functools
 import os
 import queue
 import threading
@@ -114,6 +115,18 @@ class OpenVINOBackend:
             raise BackendError(
                 f"{self._path}: OpenVINO cannot compile it for {self._device} ({' '.join(str(error).split())[:160]})"
             ) from error
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle it as what opens it again: its file, which must be there, and its options."""
+        reopen = functools.partial(
+            OpenVINOBackend,
+            self._path.absolute(),
+            self._device,
+            precision=self.precision,
+            streams=self.streams,
+            threads=self._threads,
+        )
+        return reopen, ()
 
     @property
     def card(self) -> ModelCard:
