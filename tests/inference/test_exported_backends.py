@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import pickle
 import shutil
 import subprocess
 import sys
@@ -83,6 +85,27 @@ def test_in_parallel_gives_the_same(artefacts: Artefacts, name: str, kind: Any) 
             assert np.mean(got.lane == one.lane) > 0.999
 
 
+@pytest.mark.parametrize(
+    ("name", "kind", "held"), [("model.onnx", OnnxBackend, "_session"), ("model.xml", OpenVINOBackend, "_idle")]
+)
+def test_two_uses_in_parallel_share_and_the_last_one_restores(
+    artefacts: Artefacts, name: str, kind: Any, held: str
+) -> None:
+    backend = kind(artefacts.folder / name, threads=2)
+    before = getattr(backend, held)
+    for _ in range(2):
+        first, second = backend.in_parallel(), backend.in_parallel()
+        assert first.__enter__() == 2
+        shared = getattr(backend, held)
+        assert shared is not before
+        assert second.__enter__() == 2
+        assert getattr(backend, held) is shared
+        first.__exit__(None, None, None)
+        assert getattr(backend, held) is shared
+        second.__exit__(None, None, None)
+        assert getattr(backend, held) is before
+
+
 def test_the_first_two_images_of_a_process_may_come_at_once(artefacts: Artefacts) -> None:
     program = f"""
 import threading, numpy as np
@@ -99,6 +122,22 @@ threads = [threading.Thread(target=work) for _ in range(2)]
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
 
 
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("model.onnx", OnnxBackend), ("model.xml", OpenVINOBackend), ("model.ncnn.param", NcnnBackend)],
+)
+def test_a_predictor_goes_to_other_processes(artefacts: Artefacts, name: str, kind: Any) -> None:
+    if kind is NcnnBackend:
+        pytest.importorskip("pnnx")
+        pytest.importorskip("ncnn")
+    predictor = trilitenet.Predictor(kind(artefacts.folder / name, threads=1), batch_size=3)
+    copy = pickle.loads(pickle.dumps(predictor))  # noqa: S301 - its own
+    assert (copy.backend.name, copy.batch_size) == (predictor.backend.name, 3)
+    for one, other in zip(predictor([*artefacts.images]), copy([*artefacts.images]), strict=True):
+        assert one.lane is not None
+        np.testing.assert_array_equal(other.lane, one.lane)
+
+
 def test_a_closed_model_says_so(artefacts: Artefacts) -> None:
     backend = OpenVINOBackend(artefacts.folder / "model.xml")
     backend.close()
@@ -113,6 +152,20 @@ def test_wrong_size_is_refused(artefacts: Artefacts, kind: Any) -> None:
         backend.run(np.zeros((1, 96, 128, 3), np.uint8))
     with pytest.raises(ShapeError, match="uint8"):
         backend.run(np.zeros((1, 64, 128, 3), np.float32))
+
+
+@pytest.mark.parametrize("kind", [OnnxBackend, OpenVINOBackend])
+def test_what_a_runtime_cannot_take_is_one_line(artefacts: Artefacts, kind: Any) -> None:
+    backend = kind(artefacts.folder / "model.onnx")
+    with pytest.raises(ShapeError, match="B >= 1"):
+        backend.run(np.zeros((0, *SIZE, 3), np.uint8))
+    backend.info = dataclasses.replace(backend.info, size=None)  # it says it is dynamic, and is not
+    with pytest.raises(ShapeError, match="multiples of 32 pixels, got 64x50"):
+        backend.run(np.zeros((1, 50, 64, 3), np.uint8))
+    with pytest.raises(BackendError, match="the runtime failed") as caught:
+        backend.run(np.zeros((1, 96, 96, 3), np.uint8))
+    assert "\n" not in str(caught.value)
+    backend.run(np.zeros((1, *SIZE, 3), np.uint8))
 
 
 @pytest.mark.parametrize(

@@ -78,6 +78,14 @@ def test_images_may_come_from_a_generator() -> None:
         predictor(None)  # type: ignore[call-overload]
 
 
+def test_images_in_memory_may_come_one_by_one_each_with_its_source() -> None:
+    predictor, scene = Predictor(ColourBackend(), batch_size=2), coloured_scene()
+    found = predictor.perceive((scene for _ in range(3)), iter("abc"))
+    assert [perception.source for perception in found] == ["a", "b", "c"]
+    with pytest.raises(ConfigError, match="got 2 images and 1 sources"):
+        predictor.perceive([scene, scene], ["a"])
+
+
 def test_stages_make_the_whole() -> None:
     predictor = Predictor(ColourBackend())
     scene = coloured_scene(720, 1280)

@@ -96,6 +96,7 @@ def test_colours_survive_the_way_there_and_back(tmp_path: Path) -> None:
         (Clip(every=6), [0, 6, 12, 18]),
         (Clip(start=1.5), [15, 16, 17, 18, 19]),
         (Clip(end=0.3), [0, 1, 2]),
+        (Clip(start=0.52, end=1.2, every=3), [6, 9]),
         (Clip(start=0.55, end=1.2, every=3), [6, 9]),
         (Clip(max_frames=2), [0, 1]),
         (Clip(start=1.0, max_frames=2, every=4), [10, 14]),
@@ -115,6 +116,13 @@ def test_a_variable_frame_rate_is_kept(tmp_path: Path) -> None:
     frames = list(VideoReader(video(tmp_path / "a.mp4", frames=6, times=times)))
     assert [frame.timestamp for frame in frames] == pytest.approx(times, abs=1e-3)
     assert [index_of(frame) for frame in frames] == list(range(6))
+
+
+def test_the_index_at_a_variable_frame_rate_counts_what_was_skipped(tmp_path: Path) -> None:
+    path = video(tmp_path / "a.mp4", frames=6, times=[0, 0.1, 0.15, 0.5, 0.9, 2.0])
+    for start in (0.12, 0.4):
+        frames = list(VideoReader(path, Clip(start=start)))
+        assert [index_of(frame) for frame in frames] == [frame.index for frame in frames]
 
 
 @pytest.mark.parametrize(("matrix", "turns"), [((0, 1, -1, 0), -1), ((-1, 0, 0, -1), 2), ((0, -1, 1, 0), 1)])
@@ -144,6 +152,7 @@ def test_broken_frames_are_left_out_and_counted(tmp_path: Path, caplog: pytest.L
     assert 10 <= len(frames) < 20
     times = [frame.timestamp or 0.0 for frame in frames]
     assert times == sorted(times)
+    assert [frame.index for frame in frames] == [round(time * 10) for time in times]
 
 
 def test_a_video_cut_short_gives_what_there_is(tmp_path: Path) -> None:
@@ -301,8 +310,11 @@ def test_numbered_pictures_are_a_video(tmp_path: Path) -> None:
     frames = list(reader)
     assert [index_of(frame) for frame in frames] == [3, 4, 7]
     assert [frame.timestamp for frame in frames] == [0, 0.1, pytest.approx(0.3)]
+    assert [frame.index for frame in frames] == [0, 1, 3]
     assert reader.broken == 1
     assert reader.name == str(tmp_path / "img")
+    later = list(SequenceReader(str(tmp_path / "img_%04d.png"), Clip(start=0.14), rate=10))
+    assert [(frame.index, index_of(frame)) for frame in later] == [(3, 7)]
     with pytest.raises(InputError, match="no file matches"):
         SequenceReader(str(tmp_path / "other_%04d.png"))
     with pytest.raises(ConfigError, match="must be above 0"):

@@ -217,6 +217,29 @@ def test_an_unfinished_video_has_no_final_name(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("frames", [0, 3])
+def test_giving_up_leaves_what_stood_there(tmp_path: Path, frames: int) -> None:
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"precious")
+    writer = VideoWriter(path)
+    for _ in range(frames):
+        writer.write(coloured_scene(32, 32))
+    writer.abort()
+    assert path.read_bytes() == b"precious"
+    assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
+
+
+def test_a_frame_after_the_end_is_refused(tmp_path: Path) -> None:
+    writer = VideoWriter(tmp_path / "a.mp4")
+    writer.write(coloured_scene(32, 32))
+    writer.close()
+    with pytest.raises(OutputError, match=r"a\.mp4: the video was closed"):
+        writer.write(coloured_scene(32, 32))
+    writer.abort()
+    writer.close()
+    assert (tmp_path / "a.mp4").exists()
+
+
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     writer = VideoWriter(tmp_path / "file" / "a.mp4")

@@ -15,6 +15,8 @@ from trilitenet.road.structures import LaneLine
 
 CAMERA = Camera((720, 1280), 1100.0, 1105.0, 641.0, 355.0, 1.42, 0.03, -0.01, 0.005, (-0.3, 0.1, 0.001, 0.0, 0.0))
 
+SHORT = "image_width: 640\nimage_height: 360\nheight: 1.3\n"
+
 OPENCV = """%YAML:1.0
 ---
 image_width: 1280
@@ -43,6 +45,15 @@ def test_a_camera_file_round_trip(tmp_path: Path) -> None:
         write_camera(CAMERA, tmp_path / "none" / "camera.yaml")
 
 
+def test_writes_what_opencv_calibrates(tmp_path: Path) -> None:
+    fx, fy, cx, cy, mounted = np.array([1100.0, 1105.0, 641.0, 355.0, 1.42])
+    height, width = np.array([720, 1280])
+    lens = tuple(np.array([[-0.3, 0.1, 0.001, 0.0, 0.0]]).ravel())
+    camera = Camera((height, width), fx, fy, cx, cy, mounted, distortion=lens)
+    write_camera(camera, tmp_path / "camera.yaml")
+    assert read_camera(tmp_path / "camera.yaml") == camera
+
+
 def test_reads_what_opencv_writes(tmp_path: Path) -> None:
     path = tmp_path / "camera.yaml"
     path.write_text(OPENCV)
@@ -66,6 +77,14 @@ def test_a_field_of_view_is_enough(tmp_path: Path) -> None:
         ("image_width: 640\nimage_height: 360\nheight: 1.3\nfield_of_veiw: 60\n", "did you mean 'field_of_view'"),
         ("image_width: 640\nimage_height: 360\nheight: 0\nfield_of_view: 60\n", "height must be positive"),
         ("image_width: 640\nimage_height: 360\nheight: 1\ncamera_matrix: {data: [1, 2]}\n", "9 numbers, got 2"),
+        (SHORT + "camera_matrix: [[1, 2], [3]]\n", "9 numbers, got 3"),
+        (SHORT + "camera_matrix: [900, 0, .nan, 0, 900, 180, 0, 0, 1]\n", "camera_matrix must be of finite numbers"),
+        (SHORT + "camera_matrix: [900, 2, 320, 0, 900, 180, 0, 0, 1]\n", "cannot be skewed"),
+        (
+            SHORT + "camera_matrix: [900, 0, 320, 0, 900, 180, 0, 0, 1]\ndistortion_coefficients: [.nan, 0, 0, 0]\n",
+            "distortion_coefficients must be finite",
+        ),
+        (SHORT + "field_of_view: 60\ndistortion_coefficients: [-0.3, 0, 0, 0]\n", "for an ideal lens"),
         ("- 1\n", "must be a mapping"),
         ("a: [\n", "not YAML"),
     ],

@@ -68,8 +68,34 @@ def test_says_nothing_of_what_it_does_not_know() -> None:
     assert not run(detector, [Road()] * 50)
     run(detector, [road(1.0, 0.02)] * 20)
     assert detector.warnings == ("lane_departure_left",)
-    assert not run(detector, [Road()] * 50, start=1.0)  # a lane out of sight ends no departure
+    assert not run(detector, [Road()] * 40, start=0.8)  # a lane out of sight for a moment ends no departure
     assert detector.warnings == ("lane_departure_left",)
+    (event,) = run(detector, [Road()] * 50, start=2.4)
+    assert (event.kind, event.phase) == ("lane_departure_left", "end")
+    assert event.timestamp == pytest.approx(19 / 25 + 2.0, abs=0.05)
+    assert event.value == pytest.approx(-0.1)
+    assert not detector.warnings
+
+
+def test_a_lead_too_near_to_be_seen_is_not_a_danger_that_is_over() -> None:
+    detector = EventDetector()
+    closing = [road(time=3.2 - i / 25) for i in range(73)]  # at 10 m/s from 32 m to 3.2 m
+    (begin,) = run(detector, closing)
+    assert begin.phase == "begin"
+    assert not run(detector, [road()] * 45, start=73 / 25)
+    assert detector.warnings == ("forward_collision",)
+    (end,) = run(detector, [road()] * 25, start=118 / 25)
+    assert (end.kind, end.phase, end.track_id) == ("forward_collision", "end", 7)
+    assert end.value == pytest.approx(3.2 - 72 / 25)
+
+
+def test_a_lead_that_no_longer_closes_ends_the_warning() -> None:
+    detector = EventDetector()
+    run(detector, [road(time=2.0)] * 10)
+    away = LeadVehicle(0, 7, Estimate(20.0, 1.0), Estimate(-1.0, 0.5))
+    (event,) = run(detector, [Road(lead=away)] * 20, start=0.4)
+    assert (event.phase, event.value) == ("end", 2.0)
+    assert event.timestamp == pytest.approx(0.9, abs=0.05)
 
 
 def test_an_event_as_json() -> None:

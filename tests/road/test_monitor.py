@@ -13,6 +13,7 @@ import pytest
 from trilitenet.data.synthetic import Scene
 from trilitenet.errors import ShapeError
 from trilitenet.processing.geometry import Camera
+from trilitenet.road.camera import CameraErrors
 from trilitenet.road.monitor import RoadMonitor
 from trilitenet.road.structures import Road
 from trilitenet.road.tracking import Steady
@@ -88,6 +89,21 @@ def test_the_change_of_lanes_is_one_departure_to_the_left(roads: list[Road]) -> 
         ("lane_departure_left", "end"),
     ]
     assert 6.0 < events[0].timestamp < 11.0
+
+
+def test_a_warning_ends_when_the_camera_is_no_longer_trusted(
+    drive: tuple[Scene, ...], perceived: Perceive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monitor = RoadMonitor(drive[0].truth.camera)
+    scenes = iter(drive)
+    while not (road := monitor(perceived(next(scenes)))).warnings:
+        pass
+    assert road.warnings == ("lane_departure_left",)
+    monkeypatch.setattr(monitor, "_trusted", lambda _: (None, CameraErrors(), None))
+    after = [monitor(perceived(next(scenes))) for _ in range(12)]  # 3 s
+    assert after[0].warnings == ("lane_departure_left",)
+    assert [event.phase for found in after for event in found.events] == ["end"]
+    assert after[-1].warnings == ()
 
 
 def test_lines_keep_their_identity(roads: list[Road]) -> None:

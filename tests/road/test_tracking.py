@@ -51,6 +51,32 @@ def test_a_vehicle_that_fades_keeps_its_number_and_a_lost_one_does_not_return() 
     assert int(again.track_id[0]) != number
 
 
+@pytest.mark.parametrize("then", [3600.0, 1.3, 0.0])
+def test_no_track_outlives_a_leap_in_time(then: float) -> None:
+    pytest.importorskip("edgefirst.tracker")
+    tracker = VehicleTracker(memory=1.0)
+    for frame in range(5):
+        before = tracker.update(boxes(100.0), frame / 30)
+    assert before.track_id is not None
+    numbers = set[int]()
+    for frame in range(5):
+        after = tracker.update(boxes(100.0), then + frame / 30)
+        assert after.track_id is not None
+        numbers |= set(after.track_id.tolist())
+    assert numbers - {-1}
+    assert int(before.track_id[0]) not in numbers
+
+
+def test_times_out_of_range_are_refused() -> None:
+    pytest.importorskip("edgefirst.tracker")
+    for memory in (-1.0, float("inf"), float("nan")):
+        with pytest.raises(ConfigError, match="memory must be at least 0"):
+            VehicleTracker(memory=memory)
+    for timestamp in (-0.1, float("nan"), float("inf")):
+        with pytest.raises(ConfigError, match="time stamp must be at least 0"):
+            VehicleTracker().update(boxes(100.0), timestamp)
+
+
 def test_says_which_extra_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "edgefirst.tracker", None)
     with pytest.raises(MissingExtraError, match=r"trilitenet\[track\]"):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
@@ -13,10 +14,39 @@ from trilitenet.config import ModelCard
 from trilitenet.processing.cores import usable_cores
 from trilitenet.structures import RawOutputs
 
-__all__ = ["MOST_PARALLEL", "Backend", "ParallelSessions"]
+__all__ = ["MOST_PARALLEL", "Backend", "ParallelSessions", "replaced"]
 
 MOST_PARALLEL: Final = 4
 """At most so many images are computed at once where a backend trades latency for images a second."""
+
+
+_REPLACING: Final = threading.Lock()
+
+
+@contextlib.contextmanager
+def replaced(owner: Any, name: str, make: Callable[[], Any]) -> Iterator[None]:
+    """Inside, an attribute has another value. Several may be inside at once: the first makes it, the last restores.
+
+    Args:
+        owner: Whose attribute it is; one attribute of it at a time.
+        name: The attribute.
+        make: Returns the other value.
+    """
+    with _REPLACING:
+        uses, before = getattr(owner, "_replaced", (0, None))
+        if not uses:
+            before = getattr(owner, name)
+            setattr(owner, name, make())
+        owner._replaced = uses + 1, before
+    try:
+        yield
+    finally:
+        with _REPLACING:
+            uses, before = owner._replaced
+            if uses == 1:
+                setattr(owner, name, before)
+                before = None
+            owner._replaced = uses - 1, before
 
 
 class ParallelSessions:
@@ -38,11 +68,8 @@ class ParallelSessions:
         if count == 1:
             yield 1
             return
-        before, self._session = self._session, self._open(cores // count)
-        try:
+        with replaced(self, "_session", lambda: self._open(cores // count)):
             yield count
-        finally:
-            self._session = before
 
 
 @runtime_checkable

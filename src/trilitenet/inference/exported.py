@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
-from trilitenet.errors import ShapeError, WeightsError
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, MAX_STRIDE, ArtefactInfo, ModelCard
+from trilitenet.errors import BackendError, ShapeError, TriLiteNetError, WeightsError
 from trilitenet.structures import RawOutputs
 
 __all__ = ["is_int8_onnx", "prepare_input", "read_metadata", "run_images"]
@@ -82,14 +82,23 @@ def run_images(
         batch: (B, H, W, 3) uint8 RGB.
         card: Its tasks say which outputs there are.
         outputs: Runs the batch; a mapping from output name to array with a leading 1, for each image.
-        info: How masks are to be read.
+        info: The size it takes, and how masks are to be read.
 
     Raises:
-        ShapeError: If the batch is of another shape or type.
+        ShapeError: If the batch is empty, or of another shape or type, or of a size the artefact cannot take.
+        BackendError: If the runtime fails.
     """
-    if batch.ndim != 4 or batch.shape[3] != 3 or batch.dtype != np.uint8:
-        raise ShapeError(f"a batch must be (B, H, W, 3) uint8, got {batch.shape} {batch.dtype}")
-    results = outputs()
+    if batch.ndim != 4 or batch.shape[3] != 3 or batch.dtype != np.uint8 or not len(batch):
+        raise ShapeError(f"a batch must be (B, H, W, 3) uint8 with B >= 1, got {batch.shape} {batch.dtype}")
+    height, width = batch.shape[1:3]
+    if info.size is None and (min(height, width) < MAX_STRIDE or height % MAX_STRIDE or width % MAX_STRIDE):
+        raise ShapeError(f"the sides of images must be multiples of {MAX_STRIDE} pixels, got {width}x{height}")
+    try:
+        results = outputs()
+    except TriLiteNetError:
+        raise
+    except Exception as error:  # what runtimes raise shares no base class
+        raise BackendError(f"the runtime failed ({' '.join(str(error).split())[:160]})") from error
 
     def mask(name: str) -> NDArray[np.uint8] | None:
         if name not in card.tasks:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
@@ -76,6 +77,12 @@ class NcnnBackend(ParallelSessions):
         if missing:
             raise WeightsError(f"{self._path}: not a usable NCNN model (it has no {', '.join(sorted(missing))})")
         return net
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle it as what opens it again: its file, which must be there, and its options."""
+        return functools.partial(
+            NcnnBackend, self._path.absolute(), precision=self.precision, threads=self._threads
+        ), ()
 
     @property
     def card(self) -> ModelCard:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -68,6 +69,10 @@ class OnnxBackend(ParallelSessions):
         except Exception as error:  # its exceptions share no base class of their own
             reason = " ".join(str(error).split())[:160]
             raise WeightsError(f"{self._path}: not a usable ONNX model ({reason})") from error
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle it as what opens it again: its file, which must be there, and its options."""
+        return functools.partial(OnnxBackend, self._path.absolute(), self._device, threads=self._threads), ()
 
     @property
     def card(self) -> ModelCard:

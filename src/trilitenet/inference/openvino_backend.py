@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import functools
 import os
 import queue
 import threading
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ModelCard
 from trilitenet.errors import BackendError, ConfigError, WeightsError, import_extra
-from trilitenet.inference.backend import MOST_PARALLEL
+from trilitenet.inference.backend import MOST_PARALLEL, replaced
 from trilitenet.inference.exported import prepare_input, read_metadata, run_images
 from trilitenet.processing.cores import usable_cores
 from trilitenet.structures import RawOutputs
@@ -115,6 +116,18 @@ class OpenVINOBackend:
                 f"{self._path}: OpenVINO cannot compile it for {self._device} ({' '.join(str(error).split())[:160]})"
             ) from error
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle it as what opens it again: its file, which must be there, and its options."""
+        reopen = functools.partial(
+            OpenVINOBackend,
+            self._path.absolute(),
+            self._device,
+            precision=self.precision,
+            streams=self.streams,
+            threads=self._threads,
+        )
+        return reopen, ()
+
     @property
     def card(self) -> ModelCard:
         """What the network is."""
@@ -170,11 +183,8 @@ class OpenVINOBackend:
         if count <= self.streams:
             yield self.streams
             return
-        before, self._idle = self._idle, _requests(self._compile(count), count)
-        try:
+        with replaced(self, "_idle", lambda: _requests(self._compile(count), count)):
             yield count
-        finally:
-            self._idle = before
 
     def close(self) -> None:
         """Free the compiled model's requests."""

@@ -97,14 +97,21 @@ class Predictor:
         return self.perceive([read_image(one) for one in images], [_name(one) for one in images])
 
     def perceive(
-        self, images: Sequence[NDArray[np.uint8]], sources: Sequence[str | None] | None = None
+        self, images: Iterable[NDArray[np.uint8]], sources: Iterable[str | None] | None = None
     ) -> list[Perception]:
         """Perceive images that are in memory; neighbours of one canvas size share a batch.
 
         Args:
             images: (height, width, 3) uint8 RGB each.
             sources: Where each came from.
+
+        Raises:
+            ConfigError: If there are more or fewer sources than images.
         """
+        images = list(images)
+        sources = [None] * len(images) if sources is None else list(sources)
+        if len(sources) != len(images):
+            raise ConfigError(f"each image has one source, got {len(images)} images and {len(sources)} sources")
         perceptions: list[Perception] = []
         letterboxes = [self.fit(image) for image in images]
         for part in _runs([letterbox.canvas for letterbox in letterboxes], self.batch_size):
@@ -112,9 +119,7 @@ class Predictor:
             for canvas, image, letterbox in zip(batch, images[part], letterboxes[part], strict=True):
                 letterbox.image(image, out=canvas)
             raw = self.backend.run(batch)
-            perceptions += self.postprocess(
-                raw, letterboxes[part], images[part], None if sources is None else sources[part]
-            )
+            perceptions += self.postprocess(raw, letterboxes[part], images[part], sources[part])
         return perceptions
 
     def fit(self, image: NDArray[np.uint8]) -> Letterbox:

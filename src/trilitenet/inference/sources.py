@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import functools
 import glob
+import itertools
 import logging
 import math
 import os
@@ -54,6 +55,8 @@ VIDEO_SUFFIXES: Final = frozenset(
 
 _LOGGER: Final = logging.getLogger(__name__)
 _NUMBERED: Final = re.compile(r"%0?(\d*)d")
+_SLACK: Final = 1e-6
+"""Seconds that a time stamp may be off by: a frame at 1/3 s is not before a start of 0.333333."""
 _Decoded: TypeAlias = tuple[float, Callable[[], NDArray[np.uint8]]]
 """Seconds from the start, and what makes the RGB image of it (not called for frames that are left out)."""
 
@@ -65,7 +68,7 @@ class Frame:
     Attributes:
         image: (height, width, 3) uint8 RGB, upright.
         source: The path, URL or name it came from.
-        index: Position in the video, from 0; None for a still picture.
+        index: Position in the video, from 0, frames that were skipped or left out included; None for a still picture.
         timestamp: Seconds from the start of the video; None for a still picture.
     """
 
@@ -117,10 +120,15 @@ class Clip:
     def expected(self, frames: int | None, rate: float | None) -> int | None:
         """Return about how many frames remain of a video of so many, at so many a second; None if unknown."""
         if frames is not None and rate:
-            last = frames if self.end is None else min(frames, round(self.end * rate))
-            wanted = -(-max(0, last - round(self.start * rate)) // self.every)
+            last = frames if self.end is None else min(frames, _first_from(self.end, rate))
+            wanted = -(-max(0, last - _first_from(self.start, rate)) // self.every)
             return wanted if self.max_frames is None else min(wanted, self.max_frames)
         return self.max_frames
+
+
+def _first_from(seconds: float, rate: float) -> int:
+    """Return the index of the first frame that is not before this time, at a constant rate."""
+    return max(0, math.ceil((seconds - _SLACK) * rate))
 
 
 class FrameReader(abc.ABC):
@@ -153,17 +161,17 @@ class FrameReader(abc.ABC):
 
     def __iter__(self) -> Iterator[Frame]:
         given = seen = 0
+        broken = self.broken
         with contextlib.closing(self._decode()) as decoded:
-            for timestamp, make in decoded:
-                # To a microsecond: a frame at 1/3 s is not before a start of 0.333333.
-                if timestamp < self.clip.start - 1e-6:
+            for count, (timestamp, make) in enumerate(decoded):
+                if timestamp < self.clip.start - _SLACK:
                     continue
-                if self.clip.end is not None and timestamp >= self.clip.end - 1e-6:
+                if self.clip.end is not None and timestamp >= self.clip.end - _SLACK:
                     break
                 seen += 1
                 if (seen - 1) % self.clip.every:
                     continue
-                yield Frame(make(), self.name, self._index(timestamp, seen - 1), timestamp)
+                yield Frame(make(), self.name, self._index(timestamp, count + self.broken - broken), timestamp)
                 given += 1
                 if given == self.clip.max_frames:
                     break
@@ -171,9 +179,9 @@ class FrameReader(abc.ABC):
             part = "" if self.clip.start == 0 and self.clip.end is None else " between --start and --end"
             raise InputError(f"{self.name}: has no frames that can be decoded{part}")
 
-    def _index(self, timestamp: float, seen: int) -> int:
-        """Return the position in the video: counted, or by time if the beginning was skipped."""
-        return seen + round(self.clip.start * self.rate) if self.clip.start and self.rate else seen
+    def _index(self, timestamp: float, count: int) -> int:
+        """Return the position in the video of a frame before which so many came, broken ones included."""
+        return count
 
     @abc.abstractmethod
     def _decode(self) -> Any:
@@ -184,7 +192,8 @@ class VideoReader(FrameReader):
     """A video file, or standard input, by PyAV.
 
     Rotation noted in the file is applied, time stamps are the file's own (so that a variable frame rate is kept), and a
-    frame that cannot be decoded is left out and counted.
+    frame that cannot be decoded is left out and counted. Where the frame rate varies and the beginning is skipped, the
+    index is estimated by the mean rate.
 
     Args:
         path: The file, or ``"-"`` for standard input.
@@ -198,11 +207,14 @@ class VideoReader(FrameReader):
     def __init__(self, path: str | Path, clip: Clip | None = None) -> None:
         super().__init__("stdin" if str(path) == "-" else _without_secrets(str(path)), clip)
         self._path = str(path)
+        self._constant = False
+        self._skipped = 0
         if self._path != "-":
             with _open_container(self._path, self.name) as container:
                 stream = container.streams.video[0]
                 rate = stream.average_rate or stream.guessed_rate
                 self.rate = float(rate) if rate else None
+                self._constant = bool(rate) and stream.average_rate == stream.base_rate
                 frames = stream.frames or None
                 if frames is None and container.duration and self.rate:
                     frames = round(container.duration / 1e6 * self.rate)
@@ -215,9 +227,16 @@ class VideoReader(FrameReader):
                 first = stream.start_time or 0
                 with contextlib.suppress(_av().FFmpegError):  # what cannot seek is read from its beginning
                     container.seek(first + int(self.clip.start / stream.time_base), stream=stream)
-            yield from _frames_of(container, self)
+            frames = _frames_of(container, self)
+            for timestamp, make in itertools.islice(frames, 1):
+                self._skipped = round(timestamp * (self.rate or 0))  # 0 but after a seek
+                yield timestamp, make
+            yield from frames
         if self.broken:
             _LOGGER.warning("%s: %d broken frames were left out", self.name, self.broken)
+
+    def _index(self, timestamp: float, count: int) -> int:
+        return round(timestamp * self.rate) if self._constant and self.rate else self._skipped + count
 
 
 class StreamReader(FrameReader):
@@ -360,7 +379,7 @@ class SequenceReader(FrameReader):
         assert self.rate is not None
         for number, path in enumerate(self._paths):
             timestamp = number / self.rate
-            if timestamp < self.clip.start - 1e-6:
+            if timestamp < self.clip.start - _SLACK:
                 continue
             try:
                 image = read_image(path)
@@ -369,6 +388,10 @@ class SequenceReader(FrameReader):
                 _LOGGER.warning("%s", error)
                 continue
             yield timestamp, functools.partial(np.asarray, image)
+
+    def _index(self, timestamp: float, count: int) -> int:
+        assert self.rate is not None
+        return round(timestamp * self.rate)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -209,6 +209,7 @@ class VideoWriter:
         self._last = -1
         self._waiting: queue.Queue[tuple[NDArray[np.uint8], float] | None] = queue.Queue(ahead)
         self._error: OutputError | None = None
+        self._closed = self._aborted = False
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -220,10 +221,12 @@ class VideoWriter:
             timestamp: Seconds from the start; by the frame rate if left out.
 
         Raises:
-            OutputError: If the file cannot be written; at this frame or a later one.
+            OutputError: If the file cannot be written, at this frame or a later one; or if the writer was closed.
         """
         if self._error is not None:
             raise self._error
+        if self._closed:
+            raise OutputError(f"{self.path}: the video was closed")
         self._waiting.put((image, self.frames / self._rate if timestamp is None else timestamp))
         self.frames += 1
 
@@ -233,6 +236,7 @@ class VideoWriter:
         Raises:
             OutputError: If the file cannot be written; then it is removed.
         """
+        self._closed = True
         if self._thread.is_alive():
             self._waiting.put(None)
             self._thread.join()
@@ -240,10 +244,10 @@ class VideoWriter:
             raise self._error
 
     def abort(self) -> None:
-        """Forget the file."""
+        """Forget the file: what was written goes, what stood under its name before, or was closed, stays."""
+        self._aborted = True
         with contextlib.suppress(OutputError):
             self.close()
-        self.path.unlink(missing_ok=True)
 
     def __enter__(self) -> VideoWriter:
         return self
@@ -258,11 +262,15 @@ class VideoWriter:
         item: tuple[NDArray[np.uint8], float] | None = None
         try:
             while (item := self._waiting.get()) is not None:
-                self._encode(*item)
+                if not self._aborted:
+                    self._encode(*item)
             if self._container is not None:
                 self._mux(None)
                 self._container.close()
-                self._partial.replace(self.path)
+                if self._aborted:
+                    self._partial.unlink()
+                else:
+                    self._partial.replace(self.path)
         except Exception as error:  # whatever it is, the caller must hear of it and not wait
             reason = getattr(error, "strerror", None) or str(error)
             self._error = OutputError(f"{self.path}: the video cannot be written ({reason})")

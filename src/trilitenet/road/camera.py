@@ -88,21 +88,29 @@ def read_camera(path: str | Path) -> Camera:
         raise ConfigError(f"{path}: must be a mapping of keys such as image_width, camera_matrix and height")
     for key in ("camera_matrix", "distortion_coefficients"):
         if isinstance(content.get(key), list):
-            content[key] = {"data": np.ravel(content[key]).tolist()}
+            content[key] = {"data": _flat(content[key])}
     file = parse(_CameraFile, content, str(path))
     size = (file.image_height, file.image_width)
     pitch, yaw, roll = (math.radians(angle) for angle in (file.pitch, file.yaw, file.roll))
+    lens = () if file.distortion_coefficients is None else file.distortion_coefficients.data
     try:
+        if not all(map(math.isfinite, lens)):
+            raise ConfigError("distortion_coefficients must be finite numbers")
         if file.camera_matrix is None:
             if file.field_of_view is None:
                 raise ConfigError("needs camera_matrix, or field_of_view in degrees")
+            if any(lens):
+                raise ConfigError("field_of_view is for an ideal lens; distortion_coefficients need camera_matrix")
             return Camera.from_field_of_view(size, file.field_of_view, file.height, pitch=pitch, yaw=yaw, roll=roll)
         if file.field_of_view is not None:
             raise ConfigError("camera_matrix and field_of_view exclude each other")
         matrix = file.camera_matrix.data
         if len(matrix) != 9:
             raise ConfigError(f"camera_matrix must have 9 numbers, got {len(matrix)}")
-        lens = () if file.distortion_coefficients is None else file.distortion_coefficients.data
+        if not all(map(math.isfinite, matrix)):
+            raise ConfigError("camera_matrix must be of finite numbers")
+        if not np.allclose([matrix[i] for i in (1, 3, 6, 7, 8)], (0, 0, 0, 0, 1), rtol=0, atol=1e-6):
+            raise ConfigError("camera_matrix must be [fx, 0, cx, 0, fy, cy, 0, 0, 1]: pixels cannot be skewed")
         return Camera(
             size, matrix[0], matrix[4], matrix[2], matrix[5], file.height, pitch, yaw, roll,
             lens if any(lens) else (),
@@ -111,18 +119,24 @@ def read_camera(path: str | Path) -> Camera:
         raise ConfigError(f"{path}: {error}") from error
 
 
+def _flat(rows: list[Any]) -> list[Any]:
+    """Return the numbers of a matrix that is written as rows."""
+    return [number for row in rows for number in (row if isinstance(row, list) else [row])]
+
+
 def write_camera(camera: Camera, path: str | Path) -> None:
     """Write a camera as `read_camera` reads it.
 
     Raises:
         OutputError: If the file cannot be written.
     """
+    lens = [float(value) for value in camera.distortion]  # OpenCV calibrates to NumPy's numbers, which YAML refuses
     content = {
-        "image_width": camera.size[1],
-        "image_height": camera.size[0],
+        "image_width": int(camera.size[1]),
+        "image_height": int(camera.size[0]),
         "camera_matrix": {"rows": 3, "cols": 3, "data": [float(v) for v in camera.matrix.ravel()]},
-        "distortion_coefficients": {"rows": 1, "cols": len(camera.distortion), "data": list(camera.distortion)},
-        "height": camera.height,
+        "distortion_coefficients": {"rows": 1, "cols": len(lens), "data": lens},
+        "height": float(camera.height),
         **{name: math.degrees(getattr(camera, name)) for name in ("pitch", "yaw", "roll")},
     }
     with writing(path):

@@ -5,6 +5,7 @@ Colours are those of Okabe and Ito (2008), RGB, like the rest of the overlay's.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Collection
@@ -141,6 +142,9 @@ def _draw_above(canvas: NDArray[np.uint8], perception: Perception, road: Road, c
 
 
 def _warp(canvas: NDArray[np.uint8], camera: Camera, view: View) -> NDArray[np.uint8]:
+    if camera.distortion:
+        place, part = _above_maps(camera, view)
+        return np.asarray(cv2.remap(canvas, place, part, cv2.INTER_LINEAR, borderValue=_PLATE), np.uint8)
     matrix = _above_matrix(camera, view)
     height, width = view.size
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -150,6 +154,21 @@ def _warp(canvas: NDArray[np.uint8], camera: Camera, view: View) -> NDArray[np.u
 @functools.lru_cache(maxsize=8)
 def _above_matrix(camera: Camera, view: View) -> NDArray[np.float64]:
     return camera.ground_homography @ view.matrix
+
+
+@functools.lru_cache(maxsize=8)
+def _above_maps(camera: Camera, view: View) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+    """Return where each pixel from above is seen through the lens, as `cv2.remap` takes it.
+
+    Like `birds_eye` it shows what an ideal lens would have in the picture: further out the lens's polynomial may fold.
+    """
+    rows, columns = np.indices(view.size).reshape(2, -1)
+    ground = (np.stack([columns, rows, np.ones_like(rows)], axis=1) @ view.matrix.T)[:, :2]
+    ideal = dataclasses.replace(camera, distortion=()).to_pixels(ground)
+    inside = ((ideal > -0.5) & (ideal < np.array(camera.size[::-1]) - 0.5)).all(axis=1, keepdims=True)
+    seen = np.where(inside, camera.to_pixels(ground), -10.0)
+    place, part = cv2.convertMaps(seen.reshape(*view.size, 2).astype(np.float32), None, cv2.CV_16SC2)
+    return np.asarray(place, np.int16), np.asarray(part, np.uint16)
 
 
 def _draw_vehicle(panel: NDArray[np.uint8], view: View, rear: float, y: float, colour: Colour) -> None:

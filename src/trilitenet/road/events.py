@@ -6,12 +6,15 @@ Advisory only: they rest on one camera and a light network, and no safety functi
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from trilitenet.errors import ConfigError
 from trilitenet.road.structures import Event, EventKind, Road
 
 __all__ = ["EventDetector", "EventThresholds"]
+
+_Reading: TypeAlias = tuple[bool | None, float | None]
+"""Whether a frame wants an event to be on, and the figure that says so; None for what it does not tell."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +30,7 @@ class EventThresholds:
         collision_end: At more than which it ends.
         confirm: Seconds that a beginning must hold before it is told.
         hold: Seconds that an end must hold before it is told.
+        unknown: Seconds without a reading (no lane, or no vehicle whose speed is known) after which an event ends.
     """
 
     vehicle_width: float = 1.8
@@ -37,6 +41,7 @@ class EventThresholds:
     collision_end: float = 3.5
     confirm: float = 0.12
     hold: float = 0.5
+    unknown: float = 2.0
 
     def __post_init__(self) -> None:
         if self.departure_end < self.departure_begin or self.collision_end < self.collision_begin:
@@ -45,26 +50,39 @@ class EventThresholds:
 
 @dataclasses.dataclass
 class _State:
-    """One kind of event: whether it is on, and since when the opposite is seen."""
+    """One kind of event: whether it is on, since when the opposite is seen, and the last reading."""
 
     on: bool = False
     since: float | None = None
+    read: float = 0.0
+    value: float = 0.0
 
-    def step(self, wants: bool | None, timestamp: float, confirm: float, hold: float) -> Literal["begin", "end"] | None:
+    def step(
+        self, wants: bool | None, value: float | None, timestamp: float, limits: EventThresholds
+    ) -> Literal["begin", "end"] | None:
         """Take in one frame.
 
         Args:
             wants: True or False for what this frame says, None if it says nothing.
+            value: What the frame reads; None if it has no figure, so that the last one stays.
             timestamp: Seconds.
-            confirm: Seconds before a beginning is told.
-            hold: Seconds before an end is told.
+            limits: How long a beginning and an end must hold, and how long there may be nothing.
         """
-        if wants is None or wants == self.on:
+        if value is not None:
+            self.value = value
+        if wants is None:
+            self.since = None
+            if not self.on or 0 <= timestamp - self.read <= limits.unknown:
+                return None
+            self.on = False
+            return "end"
+        self.read = timestamp
+        if wants == self.on:
             self.since = None
             return None
         if self.since is None:
             self.since = timestamp
-        if timestamp - self.since < (hold if self.on else confirm):
+        if timestamp - self.since < (limits.hold if self.on else limits.confirm):
             return None
         self.on, self.since = wants, None
         return "begin" if wants else "end"
@@ -95,13 +113,13 @@ class EventDetector:
             frame: Index of the frame.
         """
         events: list[Event] = []
-        readings = {**self._departures(road), "forward_collision": self._collision(road)}
+        readings: dict[EventKind, _Reading] = {**self._departures(road), "forward_collision": self._collision(road)}
         for kind, state in self._states.items():
             wants, value = readings[kind]
-            phase = state.step(wants, timestamp, self.thresholds.confirm, self.thresholds.hold)
+            phase = state.step(wants, value, timestamp, self.thresholds)
             if phase is not None:
                 track = self._track if kind == "forward_collision" else -1
-                events.append(Event(kind, phase, timestamp, frame, value, track))
+                events.append(Event(kind, phase, timestamp, frame, state.value, track))
         return tuple(events)
 
     @property
@@ -109,11 +127,11 @@ class EventDetector:
         """Kinds of events that are on."""
         return tuple(kind for kind, state in self._states.items() if state.on)
 
-    def _departures(self, road: Road) -> dict[EventKind, tuple[bool | None, float]]:
+    def _departures(self, road: Road) -> dict[EventKind, _Reading]:
         limits, lane = self.thresholds, road.ego_lane
         if lane is None or lane.offset is None or lane.width is None:
-            return {"lane_departure_left": (None, 0.0), "lane_departure_right": (None, 0.0)}
-        found: dict[EventKind, tuple[bool | None, float]] = {}
+            return {"lane_departure_left": (None, None), "lane_departure_right": (None, None)}
+        found: dict[EventKind, _Reading] = {}
         sides: tuple[tuple[EventKind, float], ...] = (("lane_departure_left", 1.0), ("lane_departure_right", -1.0))
         for kind, side in sides:
             room = lane.width.value / 2 - side * lane.offset.value - limits.vehicle_width / 2
@@ -128,12 +146,13 @@ class EventDetector:
             found[kind] = (wants, room)
         return found
 
-    def _collision(self, road: Road) -> tuple[bool | None, float]:
+    def _collision(self, road: Road) -> _Reading:
         limits, lead = self.thresholds, road.lead
-        time = None if lead is None else lead.time_to_collision
-        if self._states["forward_collision"].on:
-            return (time is not None and time.value < limits.collision_end), 0.0 if time is None else time.value
-        if lead is None or time is None:
-            return False, 0.0
-        self._track = lead.track_id
-        return time.value < limits.collision_begin, time.value
+        if lead is None:
+            return None, None  # too near to be measured, hidden, or gone
+        time, on = lead.time_to_collision, self._states["forward_collision"].on
+        if time is None:
+            return (None if lead.closing_speed is None else False), None
+        if not on:
+            self._track = lead.track_id
+        return time.value < (limits.collision_end if on else limits.collision_begin), time.value

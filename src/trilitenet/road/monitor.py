@@ -78,7 +78,7 @@ class RoadMonitor:
             lines = assign_positions(lines, [_column_right(line, perception.size) for line in lines])
             if self._calibration is not None:
                 self._calibration.update(lines)
-            return Road(tuple(lines), drivable)
+            return self._with_events(Road(tuple(lines), drivable), perception, timestamp)
         lines = [dataclasses.replace(line, ground=ground_curve(line, camera)) for line in lines]
         lines = assign_positions(lines, [_metres_right(line) for line in lines])
         if self._calibration is not None:
@@ -89,10 +89,7 @@ class RoadMonitor:
         fit = fit_ego_lane(*road.ego_lines, camera, errors, usual=usual, known_width=self._width)
         if fit is not None:
             road = self._with_lane(road, fit, perception, camera, errors, timestamp)
-        if not self._still:
-            events = self._events.update(road, timestamp, perception.frame)
-            road = dataclasses.replace(road, events=events, warnings=self._events.warnings)
-        return road
+        return self._with_events(road, perception, timestamp)
 
     def _prepare(self, size: tuple[int, int]) -> None:
         if size == self._size:
@@ -150,6 +147,12 @@ class RoadMonitor:
         if lane.width is None and lane.offset is not None:
             lane = dataclasses.replace(lane, width=self._width)
         return dataclasses.replace(road, ego_lane=lane, lead=lead)
+
+    def _with_events(self, road: Road, perception: Perception, timestamp: float) -> Road:
+        if self._still:
+            return road
+        events = self._events.update(road, timestamp, perception.frame)
+        return dataclasses.replace(road, events=events, warnings=self._events.warnings)
 
 
 def _outlines(mask: NDArray[np.bool_]) -> tuple[NDArray[np.float32], ...]:

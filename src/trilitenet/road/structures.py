@@ -175,7 +175,8 @@ class Event:
         phase: ``"begin"`` or ``"end"``.
         timestamp: Seconds from the start of the video.
         frame: Index of the frame; None without one.
-        value: What crossed the threshold: metres to the line, or seconds to collision.
+        value: What crossed the threshold: metres to the line, or seconds to collision; the last one known, where an
+            event ends because nothing was seen any more.
         track_id: The vehicle it is about; -1 where there is none.
     """
 

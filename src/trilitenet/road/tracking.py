@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
@@ -26,26 +28,40 @@ class VehicleTracker:
     Args:
         sure: Confidence in [0, 1] above which a box may begin a track.
         overlap: Least intersection over union of a box with where its track is expected.
-        memory: Seconds that a track lives on without a box.
+        memory: Seconds that a track lives on without a box, or without a frame.
 
     Raises:
+        ConfigError: If ``memory`` is negative or not finite.
         MissingExtraError: If the extra ``track`` is not installed.
     """
 
     def __init__(self, *, sure: float = 0.4, overlap: float = 0.2, memory: float = 1.0) -> None:
+        if not 0.0 <= memory < math.inf:
+            raise ConfigError(f"memory must be at least 0 seconds, got {memory}")
         module: Any = import_extra("edgefirst.tracker", "track")
-        self._tracker = module.ByteTrack(sure, overlap, 0.5, int(memory * 1e9))
+        self._new = functools.partial(module.ByteTrack, sure, overlap, 0.5, int(memory * 1e9))
+        self._tracker = self._new()
         self._numbers: dict[str, tuple[int, float]] = {}
         self._next = 1
         self._memory = memory
+        self._last: float | None = None
 
     def update(self, boxes: Boxes, timestamp: float) -> Boxes:
         """Return the boxes of the next frame with ``track_id`` (-1 = none yet).
 
         Args:
             boxes: Boxes of one frame.
-            timestamp: Seconds, not falling from call to call.
+            timestamp: Seconds. Where they fall, or leap by more than ``memory``, all tracks end; no identity is given
+                twice.
+
+        Raises:
+            ConfigError: If the time stamp is negative or not finite.
         """
+        if not 0.0 <= timestamp < math.inf:
+            raise ConfigError(f"a time stamp must be at least 0 seconds, got {timestamp}")
+        if self._last is not None and not 0 <= timestamp - self._last <= self._memory + 1e-6:
+            self._tracker, self._numbers = self._new(), {}
+        self._last = timestamp
         tracks = self._tracker.update(
             np.ascontiguousarray(boxes.xyxy, np.float32),
             np.ascontiguousarray(boxes.confidence, np.float32),
