@@ -44,8 +44,8 @@ class Camera:
         distortion: OpenCV's coefficients (k1, k2, p1, p2[, k3[, ...]]); empty for an ideal lens.
 
     Raises:
-        ConfigError: If a length is not positive, an angle not between -pi/2 and pi/2, or the number of distortion
-            coefficients not one of OpenCV's.
+        ConfigError: If a number is not finite, a length not positive, an angle not between -pi/2 and pi/2, or the
+            number of distortion coefficients not one of OpenCV's.
     """
 
     size: tuple[int, int]
@@ -64,6 +64,8 @@ class Camera:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ConfigError(f"camera {name} must be positive, got {value}")
+        if not all(map(math.isfinite, (self.cx, self.cy, *self.distortion))):
+            raise ConfigError("camera cx, cy and distortion must be finite numbers")
         for name in ("pitch", "yaw", "roll"):
             value = getattr(self, name)
             if not abs(value) < math.pi / 2:

@@ -94,8 +94,6 @@ def read_camera(path: str | Path) -> Camera:
     pitch, yaw, roll = (math.radians(angle) for angle in (file.pitch, file.yaw, file.roll))
     lens = () if file.distortion_coefficients is None else file.distortion_coefficients.data
     try:
-        if not all(map(math.isfinite, lens)):
-            raise ConfigError("distortion_coefficients must be finite numbers")
         if file.camera_matrix is None:
             if file.field_of_view is None:
                 raise ConfigError("needs camera_matrix, or field_of_view in degrees")
@@ -107,8 +105,6 @@ def read_camera(path: str | Path) -> Camera:
         matrix = file.camera_matrix.data
         if len(matrix) != 9:
             raise ConfigError(f"camera_matrix must have 9 numbers, got {len(matrix)}")
-        if not all(map(math.isfinite, matrix)):
-            raise ConfigError("camera_matrix must be of finite numbers")
         if not np.allclose([matrix[i] for i in (1, 3, 6, 7, 8)], (0, 0, 0, 0, 1), rtol=0, atol=1e-6):
             raise ConfigError("camera_matrix must be [fx, 0, cx, 0, fy, cy, 0, 0, 1]: pixels cannot be skewed")
         return Camera(
