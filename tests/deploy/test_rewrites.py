@@ -229,3 +229,10 @@ def test_rewrites_leave_the_network_alone() -> None:
     before = {name: value.clone() for name, value in network.state_dict().items()}
     DeployGraph(network, bgr=True)
     assert all(torch.equal(before[name], value) for name, value in network.state_dict().items())
+
+
+@pytest.mark.parametrize("threshold", [0.0, 1.0])
+def test_the_ends_of_a_threshold_decide_everything(threshold: float) -> None:
+    kernel = rewrites.mask_difference(1, threshold)
+    decision = F.conv2d(torch.tensor([-5.0, 5.0]).double().view(1, 2, 1, 1), kernel.weight, kernel.bias)
+    assert bool(decision > 0) == (threshold == 0)

@@ -88,3 +88,18 @@ def test_in_parallel_each_thread_has_cores_of_its_own(backend: TorchBackend, rng
         torch.set_num_threads(before)
     for one, other in zip(alone, together, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4)  # type: ignore[arg-type]
+
+
+def test_batches_are_checked_and_left_as_they_are() -> None:
+    backend = TorchBackend(build_network("tiny", tasks=("lane",)), "cpu")
+    for batch in (
+        np.zeros((1, 64, 64, 3), np.float32),
+        np.zeros((64, 64, 3), np.uint8),
+        np.zeros((0, 64, 64, 3), np.uint8),
+    ):
+        with pytest.raises(ShapeError, match="a batch must be"):
+            backend.run(batch)  # type: ignore[arg-type]
+    image = np.random.default_rng(0).integers(0, 256, (1, 64, 64, 3), np.uint8)
+    lane = backend.run(image[..., ::-1]).lane
+    assert lane is not None
+    np.testing.assert_array_equal(lane, backend.run(np.ascontiguousarray(image[..., ::-1])).lane)

@@ -100,3 +100,9 @@ def test_uncertainty_weighting_starts_as_the_fixed_sum_and_learns() -> None:
     expected = 1 - torch.stack([sum(fixed[1:4]), sum(fixed[4:6]), sum(fixed[6:8])])
     torch.testing.assert_close(parameter.grad, expected)
     assert not list(MultiTaskLoss(DetectionLoss(ANCHORS, 1)).parameters())
+
+
+def test_uncertainty_weighting_takes_an_image_without_any_loss() -> None:
+    outputs, batch = case()
+    loss = MultiTaskLoss(None, balancing="uncertainty")
+    assert loss(outputs._replace(drivable=None, lane=None), batch).total.item() == 0.0

@@ -116,3 +116,9 @@ def test_refuses_wrong_shapes() -> None:
         focal_loss(torch.zeros(1, 3, 4, 4), torch.zeros(1, 4, 4, dtype=torch.uint8))
     with pytest.raises(ShapeError, match="logits must be"):
         tversky_loss(torch.zeros(1, 2, 4, 4), torch.zeros(1, 4, 5, dtype=torch.uint8))
+
+
+def test_any_memory_format_will_do() -> None:
+    logits, target = torch.randn(1, 2, 6, 4), torch.randint(0, 2, (1, 4, 6))
+    turned = SegmentationLoss(0.7, 0.3)(logits.transpose(2, 3), target)
+    torch.testing.assert_close(turned, SegmentationLoss(0.7, 0.3)(logits.transpose(2, 3).contiguous(), target))

@@ -12,6 +12,7 @@ from pycocotools.cocoeval import COCOeval
 
 from trilitenet.errors import ShapeError
 from trilitenet.metrics.detection import AREAS, DetectionMetric
+from trilitenet.metrics.published import PublishedDetection
 
 NO_BOXES = np.zeros((0, 4), np.float32)
 NO_CLASS = np.zeros(0, np.int64)
@@ -212,5 +213,21 @@ def test_histogram_and_curve_count_every_box(rng: np.random.Generator) -> None:
 
 
 def test_arrays_of_different_length_are_refused() -> None:
-    with pytest.raises(ShapeError, match="as many"):
+    with pytest.raises(ShapeError, match="2 predicted boxes have 1 scores"):
         DetectionMetric().update(np.zeros((2, 4)), np.zeros(1), np.zeros(2), NO_BOXES, NO_CLASS)
+
+
+@pytest.mark.parametrize("metric", [DetectionMetric(), PublishedDetection()])
+def test_what_does_not_fit_is_refused_and_nothing_of_it_is_kept(metric: DetectionMetric | PublishedDetection) -> None:
+    box = np.array([[0.0, 0.0, 9.0, 9.0]])
+    for scores, class_id, truth, truth_class in (
+        ([0.9], [1], box, [0]),
+        ([0.9], [-1], box, [0]),
+        ([0.9], [0], box, [1]),
+        ([0.9, 0.8], [0], box, [0]),
+        ([0.9], [0], box[:, :3], [0]),
+        (None, [0], box, [0]),
+    ):
+        with pytest.raises(ShapeError):
+            metric.update(box, scores, class_id, truth, truth_class)  # type: ignore[arg-type]
+    assert len(metric) == 0

@@ -6,9 +6,10 @@ import math
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from trilitenet.errors import ConfigError
-from trilitenet.metrics.lane import LaneMetric, boundary, draw_at_width, thin
+from trilitenet.errors import ConfigError, ShapeError
+from trilitenet.metrics.lane import LaneMetric, LaneScores, boundary, draw_at_width, thin
 
 
 def lines(seed: int, width: int, size: tuple[int, int] = (90, 120)) -> np.ndarray:
@@ -206,3 +207,32 @@ def test_the_state_survives_json() -> None:
 def test_impossible_widths_are_refused() -> None:
     with pytest.raises(ConfigError, match="widths"):
         LaneMetric(widths=(0,))
+
+
+def test_lines_are_compared_whole_where_a_part_is_ignored() -> None:
+    def scores(prediction: slice, truth: slice, valid: NDArray[np.bool_] | None) -> LaneScores:
+        masks = np.zeros((2, 100, 100), np.bool_)
+        masks[0, :, prediction] = masks[1, :, truth] = True
+        metric = LaneMetric()
+        metric.update(masks[0], masks[1], valid)
+        return metric.compute()
+
+    valid = np.ones((100, 100), np.bool_)
+    assert scores(slice(37, 45), slice(40, 42), valid).boundary_f[1] == 0
+    everything = scores(slice(37, 45), slice(40, 42), None)
+    assert everything.iou_at_width[8] == 1
+    for ignored in (np.s_[50:], np.s_[np.arange(100) // 10 % 2 == 1], np.s_[:, 41:]):
+        valid = np.ones((100, 100), np.bool_)
+        valid[ignored] = False
+        cut = scores(slice(37, 45), slice(40, 42), valid)
+        assert (cut.iou_at_width[8], cut.boundary_f[1]) == (1, 0)
+    valid = np.ones((100, 100), np.bool_)
+    valid[:, 50:] = False
+    assert scores(slice(48, 50), slice(50, 52), valid).precision == 1
+
+
+def test_pixels_that_count_are_a_mask_of_the_size() -> None:
+    mask = np.ones((4, 4), np.bool_)
+    for valid in (np.ones((4, 5), np.bool_), np.full((4, 4), 255, np.uint8)):
+        with pytest.raises(ShapeError, match="valid must be"):
+            LaneMetric().update(mask, mask, valid)  # type: ignore[arg-type]

@@ -229,5 +229,5 @@ def test_the_states_survive_json(rng: np.random.Generator) -> None:
 def test_impossible_input_is_refused() -> None:
     with pytest.raises(ConfigError, match="batch_size"):
         PublishedSegmentation(0)
-    with pytest.raises(ShapeError, match="as many"):
+    with pytest.raises(ShapeError, match="2 predicted boxes have 1 scores"):
         PublishedDetection().update(np.ones((2, 4)), np.ones(1), np.zeros(2), NO_BOXES, NO_CLASS)

@@ -84,3 +84,13 @@ def test_as_binary_takes_bool_and_any_grey_level() -> None:
     assert as_binary(np.array([[0, 1, 255]], np.uint8)).tolist() == [[0, 1, 1]]
     assert as_binary(np.array([[False, True]])).tolist() == [[0, 1]]
     assert as_binary(np.array([[True, True]]), np.array([[True, False]])).tolist() == [[1, 0]]
+
+
+def test_other_types_are_refused_not_cast() -> None:
+    truth = np.ones((4, 4), np.bool_)
+    for mask in (np.full((4, 4), 0.9), np.full((4, 4), 256)):
+        with pytest.raises(ShapeError, match="bool or uint8"):
+            SegmentationMetric().update(mask, truth)
+    for valid in (np.full((4, 4), 255, np.uint8), np.ones((2, 2), np.bool_)):
+        with pytest.raises(ShapeError, match="valid must be"):
+            SegmentationMetric().update(truth, truth, valid)  # type: ignore[arg-type]

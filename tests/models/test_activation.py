@@ -7,6 +7,7 @@ from torch.nn import functional as F  # noqa: N812
 
 from trilitenet.models import activation
 from trilitenet.models.activation import AveragePool, PReLU, batch_norm_prelu
+from trilitenet.models.blocks import ConvBNPReLU
 
 
 def case(channels: int, dtype: torch.dtype, memory_format: torch.memory_format) -> tuple[Tensor, Tensor]:
@@ -103,3 +104,24 @@ def test_gradient_at_zero_is_that_of_pytorch() -> None:
     (ours,) = torch.autograd.grad(act(x).sum(), x)
     (theirs,) = torch.autograd.grad(F.prelu(x, act.weight).sum(), x)
     torch.testing.assert_close(ours, theirs)
+
+
+@pytest.mark.parametrize(
+    ("name", "part"),
+    [("act", nn.ReLU()), ("act", nn.PReLU()), ("act", PReLU(1)), ("bn", nn.GroupNorm(2, 8)), ("bn", nn.Identity())],
+)
+def test_other_layers_may_take_their_places(name: str, part: nn.Module) -> None:
+    block = ConvBNPReLU(3, 8).train()
+    setattr(block, name, part)
+    images = torch.randn(2, 3, 8, 8)
+    plain = block(images)
+    torch.testing.assert_close(block(images.to(memory_format=torch.channels_last)), plain, atol=1e-5, rtol=1e-4)
+
+
+def test_hooks_are_called() -> None:
+    block = ConvBNPReLU(3, 8).train()
+    called: list[str] = []
+    block.bn.register_forward_hook(lambda *_: called.append("bn"))
+    block.act.register_forward_hook(lambda *_: called.append("act"))
+    block(torch.randn(2, 3, 8, 8).to(memory_format=torch.channels_last))
+    assert called == ["bn", "act"]

@@ -95,7 +95,9 @@ def test_any_multiple_of_32_is_a_legal_size(size: tuple[int, int]) -> None:
     assert outputs.drivable.shape == (1, 2, *size)
 
 
-@pytest.mark.parametrize("shape", [(1, 3, 360, 640), (3, 384, 640), (1, 1, 64, 64), (1, 384, 640, 3)])
+@pytest.mark.parametrize(
+    "shape", [(1, 3, 360, 640), (3, 384, 640), (1, 1, 64, 64), (1, 384, 640, 3), (0, 3, 64, 64), (1, 3, 0, 64)]
+)
 def test_any_other_shape_is_a_clear_error(shape: tuple[int, ...]) -> None:
     with pytest.raises(ShapeError, match="multiples of 32"):
         build_network("tiny")(torch.zeros(shape))
@@ -142,3 +144,14 @@ def test_normalise_images_is_per_channel_rgb() -> None:
     image = torch.tensor([255, 0, 128], dtype=torch.uint8).view(1, 3, 1, 1)
     expected = (np.array([1, 0, 128 / 255]) - IMAGE_MEAN) / np.array(IMAGE_STD)
     np.testing.assert_allclose(normalise_images(image).flatten().numpy(), expected, rtol=1e-5)
+
+
+def test_what_is_given_is_left_as_it_is() -> None:
+    pixels = torch.full((1, 3, 4, 4), 100.0)
+    assert not torch.equal(normalise_images(pixels), pixels)
+    assert torch.equal(pixels, torch.full_like(pixels, 100.0))
+    network = build_network("tiny").train()
+    network.encoder.eval()
+    count_multiply_adds(network, (64, 64))
+    assert network.training
+    assert not network.encoder.training

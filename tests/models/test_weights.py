@@ -219,3 +219,17 @@ def test_import_refuses_the_wrong_variant(golden: dict[str, NDArray[Any]], tmp_p
         import_published(tmp_path / "tiny.pth", tmp_path / "out.safetensors", variant="base")
     with pytest.raises(ConfigError, match="unknown variant"):
         import_published(tmp_path / "tiny.pth", tmp_path / "out.safetensors", variant="huge")
+
+
+def test_what_could_not_be_loaded_is_not_written(tmp_path: Path) -> None:
+    network = build_network("tiny", classes=10)
+    path = tmp_path / "a.safetensors"
+    with pytest.raises(ConfigError, match="the card has 1 classes, the network 10"):
+        save_network(network, path, ModelCard(variant="tiny"))
+    with torch.no_grad():
+        next(network.parameters()).view(-1)[0] = 1e6
+    save_network(network, path, network.card)
+    before = path.read_bytes()
+    with pytest.raises(WeightsError, match="not finite in fp16"):
+        save_network(network, path, network.card, half=True)
+    assert path.read_bytes() == before

@@ -68,3 +68,12 @@ def test_threshold_is_strictly_above() -> None:
 def test_another_number_of_images_is_refused() -> None:
     with pytest.raises(ShapeError, match="for 1 images, there are 2"):
         to_perceptions(raw(), [LETTERBOX, LETTERBOX], Thresholds(), ("vehicle",))
+
+
+def test_boxes_in_the_padding_take_no_place() -> None:
+    letterbox = Letterbox.fit((64, 128), canvas=(128, 128))
+    rows = np.array([[64, 4, 20, 6, 0.9, 0.9], [64, 64, 20, 20, 0.8, 0.9]], np.float32)
+    raw = RawOutputs(rows[None], None, None)
+    boxes = to_perceptions(raw, [letterbox], Thresholds(max_boxes=1), ("vehicle",))[0].boxes
+    assert boxes is not None
+    np.testing.assert_allclose(boxes.confidence, [0.72])

@@ -299,8 +299,9 @@ def mask_difference(blocks: int, threshold: float) -> Kernel:
 
     Args:
         blocks: Pixels a cell; the input has 2 channels a pixel.
-        threshold: t, strictly between 0 and 1.
+        threshold: t in [0, 1]; at the ends, where the logarithm has none, as 1e-6 away from them.
     """
+    threshold = min(max(threshold, 1e-6), 1 - 1e-6)
     pair = torch.tensor([[-1.0, 1.0]], dtype=torch.float64)
     weight = torch.block_diag(*[pair] * blocks).view(blocks, 2 * blocks, 1, 1)
     return Kernel(weight, torch.full((blocks,), -math.log(threshold / (1 - threshold)), dtype=torch.float64))

@@ -11,13 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import ModelCard
+from trilitenet.errors import ShapeError
 from trilitenet.processing.cores import usable_cores
 from trilitenet.structures import RawOutputs
 
-__all__ = ["MOST_PARALLEL", "Backend", "ParallelSessions", "replaced"]
+__all__ = ["MOST_PARALLEL", "Backend", "ParallelSessions", "check_batch", "replaced"]
 
 MOST_PARALLEL: Final = 4
 """At most so many images are computed at once where a backend trades latency for images a second."""
+
+
+def check_batch(batch: NDArray[np.uint8]) -> None:
+    """Check what `Backend.run` takes.
+
+    Raises:
+        ShapeError: If it is not (B, H, W, 3) uint8, or empty.
+    """
+    if batch.ndim != 4 or batch.shape[3] != 3 or batch.dtype != np.uint8 or 0 in batch.shape:
+        raise ShapeError(f"a batch must be (B, H, W, 3) uint8 with B >= 1, got {batch.shape} {batch.dtype}")
 
 
 _REPLACING: Final = threading.Lock()

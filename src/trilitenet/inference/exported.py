@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, MAX_STRIDE, ArtefactInfo, ModelCard
 from trilitenet.errors import BackendError, ShapeError, TriLiteNetError, WeightsError
+from trilitenet.inference.backend import check_batch
 from trilitenet.structures import RawOutputs
 
 __all__ = ["is_int8_onnx", "prepare_input", "read_metadata", "run_images"]
@@ -88,8 +89,7 @@ def run_images(
         ShapeError: If the batch is empty, or of another shape or type, or of a size the artefact cannot take.
         BackendError: If the runtime fails.
     """
-    if batch.ndim != 4 or batch.shape[3] != 3 or batch.dtype != np.uint8 or not len(batch):
-        raise ShapeError(f"a batch must be (B, H, W, 3) uint8 with B >= 1, got {batch.shape} {batch.dtype}")
+    check_batch(batch)
     height, width = batch.shape[1:3]
     if info.size is None and (min(height, width) < MAX_STRIDE or height % MAX_STRIDE or width % MAX_STRIDE):
         raise ShapeError(f"the sides of images must be multiples of {MAX_STRIDE} pixels, got {width}x{height}")

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from trilitenet.config import ModelCard
 from trilitenet.errors import BackendError
-from trilitenet.inference.backend import MOST_PARALLEL
+from trilitenet.inference.backend import MOST_PARALLEL, check_batch
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
 from trilitenet.structures import RawOutputs
 
@@ -72,6 +72,8 @@ class TorchBackend:
 
     def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
         """Run the network on (B, H, W, 3) uint8 RGB; see `Backend.run`."""
+        check_batch(batch)
+        batch = np.ascontiguousarray(batch)  # PyTorch takes no reversed axes
         try:
             with torch.inference_mode():
                 # NHWC seen as NCHW is the channels-last memory format: nothing is copied.

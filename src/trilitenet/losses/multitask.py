@@ -116,7 +116,7 @@ class MultiTaskLoss(nn.Module):
         extra = zero
         if self.log_variance is not None:
             weights = [weight * torch.exp(-s) for weight, s in zip(self.weights, self.log_variance, strict=True)]
-            extra = torch.stack([s for s, there in zip(self.log_variance, present, strict=True) if there]).sum()
+            extra = (self.log_variance * torch.tensor(present, device=zero.device)).sum()
         task = (0, 0, 0, 1, 1, 2, 2)
         parts = [term * weights[index] for term, index in zip(terms, task, strict=True)]
         total = torch.stack(parts).sum() + extra

@@ -157,7 +157,7 @@ class _Sums(torch.autograd.Function):
                 p = torch.exp(log_p, out=x)
                 miss = 1 - p
                 factor = miss.pow(gamma).mul_((foreground * (on - off)).add_(off).mul_(weight))
-                sums[0] -= torch.dot(factor.view(-1), log_p.view(-1))
+                sums[0] -= torch.dot(factor.reshape(-1), log_p.reshape(-1))
                 slope = p.mul_(log_p).mul_(gamma).sub_(miss).mul_(factor).mul_(sign)
                 of_focal[part, channel] = slope if channel else slope.neg_()
         ctx.save_for_backward(of_focal, of_soft, target)

@@ -27,7 +27,15 @@ from trilitenet.metrics.arithmetic import box_area, box_cover, box_overlap, mean
 from trilitenet.metrics.ranking import RankedBoxes, RankedSums
 from trilitenet.metrics.rows import Rows, pack_tables, unpack_tables
 
-__all__ = ["AREAS", "IOU_THRESHOLDS", "DetectionCurve", "DetectionMetric", "DetectionScores", "OperatingPoint"]
+__all__ = [
+    "AREAS",
+    "IOU_THRESHOLDS",
+    "DetectionCurve",
+    "DetectionMetric",
+    "DetectionScores",
+    "OperatingPoint",
+    "check_image",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -116,6 +124,34 @@ class DetectionScores:
     recall_all: float
 
 
+def check_image(
+    boxes: NDArray[Any] | None,
+    scores: NDArray[Any] | None,
+    class_id: NDArray[Any] | None,
+    truth: NDArray[Any] | None,
+    truth_class: NDArray[Any] | None,
+    classes: int,
+) -> bool:
+    """Return whether an image counts: whether there are predicted boxes and true ones, be they none.
+
+    Raises:
+        ShapeError: If boxes are not (N, 4), have not as many scores and class ids, or a class id is not one of 0 ..
+            ``classes`` - 1.
+    """
+    if boxes is None or truth is None:
+        return False
+    if scores is None or class_id is None or truth_class is None:
+        raise ShapeError("predicted boxes need scores and class ids, true ones class ids")
+    for name, rows, ids in (("predicted", boxes, class_id), ("true", truth, truth_class)):
+        if len(rows) != len(ids) or (len(rows) and np.shape(rows) != (len(rows), 4)):
+            raise ShapeError(f"{name} boxes must be (N, 4) with N class ids, got {np.shape(rows)} and {len(ids)}")
+        if len(ids) and not (np.min(ids) >= 0 and np.max(ids) < classes):
+            raise ShapeError(f"class ids of {name} boxes must be in 0 .. {classes - 1}, got {np.unique(ids)}")
+    if len(scores) != len(boxes):
+        raise ShapeError(f"{len(boxes)} predicted boxes have {len(scores)} scores")
+    return True
+
+
 class DetectionMetric:
     """Detection scores, an image at a time; about 30 bytes a box and 50 an image are kept.
 
@@ -184,18 +220,16 @@ class DetectionMetric:
             does not count.
 
         Raises:
-            ShapeError: If scores, class ids and boxes differ in number.
+            ShapeError: See `check_image`; nothing is added then.
         """
+        labelled = check_image(boxes, scores, class_id, truth, truth_class, len(self.class_names))
         self._ranked.clear()
         index = len(self._labelled)
-        labelled = boxes is not None and truth is not None
         self._labelled.append(labelled)
         objects = np.zeros((len(self.class_names), len(AREAS)), np.int32)
         if boxes is None or scores is None or class_id is None or truth is None or truth_class is None:
             self._objects.append(objects.ravel())
             return None
-        if not len(boxes) == len(scores) == len(class_id) or len(truth) != len(truth_class):
-            raise ShapeError("boxes, scores and class ids must be as many as each other")
         regions = np.zeros((0, 4)) if ignored is None else np.asarray(ignored, np.float64).reshape(-1, 4)
         order = np.argsort(-np.asarray(scores, np.float32), kind="stable")
         for number in range(len(self.class_names)):

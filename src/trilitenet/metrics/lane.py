@@ -31,6 +31,7 @@ from trilitenet.metrics.segmentation import (
     SegmentationMetric,
     SegmentationScores,
     as_binary,
+    check_valid,
     confusion,
 )
 
@@ -215,10 +216,16 @@ class LaneMetric:
         counts = None
         if prediction is not None and truth is not None:
             margin = max((1, *self.widths)) // 2 + 1
-            whole = as_binary(prediction, valid), as_binary(truth, valid)
-            pixels = whole[0].size if valid is None else int(valid.sum())
-            predicted, true = _crop_to_content(*whole, margin)
-            counts = confusion(predicted, true, pixels)
+            whole = as_binary(prediction), as_binary(truth)
+            # Lines are thinned, drawn and compared whole; what is ignored is left out of the counts alone.
+            check_valid(truth, valid)
+            seen = None if valid is None or valid.all() else as_binary(valid)
+            pixels = whole[0].size if seen is None else cv2.countNonZero(seen)
+            inside = _content(*whole, margin)
+            predicted, true = (np.ascontiguousarray(mask[inside]) for mask in whole)
+            if seen is not None:
+                seen = np.ascontiguousarray(seen[inside])
+            counts = confusion(_cut(predicted, seen), _cut(true, seen), pixels)
         self._pixels.add(counts)
         if counts is None or not any(counts[:3]):
             self._widths.append(np.zeros(4 * len(self.widths), np.int64))
@@ -226,13 +233,17 @@ class LaneMetric:
             return None
         centre = thin(true) if self.widths else true
         self._widths.append(
-            [count for width in self.widths for count in confusion(predicted, draw_at_width(centre, width))]
+            [
+                count
+                for width in self.widths
+                for count in confusion(_cut(predicted, seen), _cut(draw_at_width(centre, width), seen))
+            ]
         )
-        near = _near_counts(predicted, true, self.tolerance)
+        near = _near_counts(predicted, true, self.tolerance, seen)
         edges = boundary(predicted), boundary(true)
         rows = list(near)
         for tolerance in self.tolerances:
-            rows.extend(_near_counts(*edges, tolerance))
+            rows.extend(_near_counts(*edges, tolerance, seen))
         self._near.append(rows)
         return float(_tolerant(np.array([near], np.float64))[2][0])
 
@@ -305,25 +316,30 @@ class LaneMetric:
         return metric
 
 
-def _crop_to_content(
-    prediction: NDArray[np.uint8], truth: NDArray[np.uint8], margin: int
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Cut both masks to the rectangle that holds every foreground pixel of either, with ``margin`` pixels to spare."""
+def _content(prediction: NDArray[np.uint8], truth: NDArray[np.uint8], margin: int) -> tuple[slice, slice]:
+    """Return the rectangle that holds every foreground pixel of either mask, with ``margin`` pixels to spare."""
     if prediction.shape != truth.shape:
         raise ShapeError(f"prediction of {prediction.shape} against truth of {truth.shape}")
     left, top, width, height = cv2.boundingRect(cv2.bitwise_or(prediction, truth))
     rows = slice(max(top - margin, 0), top + height + margin)
-    inside = (rows, slice(max(left - margin, 0), left + width + margin))
-    return np.ascontiguousarray(prediction[inside]), np.ascontiguousarray(truth[inside])
+    return rows, slice(max(left - margin, 0), left + width + margin)
 
 
-def _near_counts(prediction: NDArray[np.uint8], truth: NDArray[np.uint8], radius: float) -> tuple[int, int, int, int]:
-    """Return predicted pixels, those near a true one, true pixels, those near a predicted one."""
+def _cut(mask: NDArray[np.uint8], seen: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+    """Return the mask where it is seen, all of it without ``seen``."""
+    return mask if seen is None else np.asarray(cv2.bitwise_and(mask, seen), np.uint8)
+
+
+def _near_counts(
+    prediction: NDArray[np.uint8], truth: NDArray[np.uint8], radius: float, seen: NDArray[np.uint8] | None
+) -> tuple[int, int, int, int]:
+    """Return predicted pixels, those near a true one, true pixels, those near a predicted one; of the seen ones."""
+    predicted, true = _cut(prediction, seen), _cut(truth, seen)
     return (
-        cv2.countNonZero(prediction),
-        cv2.countNonZero(cv2.bitwise_and(prediction, _near(truth, radius))),
-        cv2.countNonZero(truth),
-        cv2.countNonZero(cv2.bitwise_and(truth, _near(prediction, radius))),
+        cv2.countNonZero(predicted),
+        cv2.countNonZero(cv2.bitwise_and(predicted, _near(truth, radius))),
+        cv2.countNonZero(true),
+        cv2.countNonZero(cv2.bitwise_and(true, _near(prediction, radius))),
     )
 
 

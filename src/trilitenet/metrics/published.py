@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.errors import ConfigError, ShapeError
+from trilitenet.errors import ConfigError
 from trilitenet.metrics.arithmetic import box_overlap, mean_known, ratio, weighted_sum
-from trilitenet.metrics.detection import IOU_THRESHOLDS
+from trilitenet.metrics.detection import IOU_THRESHOLDS, check_image
 from trilitenet.metrics.ranking import RankedBoxes, RankedSums
 from trilitenet.metrics.rows import Rows, pack_tables, unpack_tables
 from trilitenet.metrics.segmentation import as_binary, confusion
@@ -256,15 +256,14 @@ class PublishedDetection:
             truth_class: (G,)
 
         Raises:
-            ShapeError: If scores, class ids and boxes differ in number.
+            ShapeError: See `trilitenet.metrics.detection.check_image`; nothing is added then.
         """
+        check_image(boxes, scores, class_id, truth, truth_class, self.classes)
         self._ranked.clear()
         if boxes is None or scores is None or class_id is None or truth is None or truth_class is None:
             self._objects.append(np.zeros(self.classes, np.int32))
             self._labelled.append(False)
             return
-        if not len(boxes) == len(scores) == len(class_id) or len(truth) != len(truth_class):
-            raise ShapeError("boxes, scores and class ids must be as many as each other")
         order = np.argsort(-np.asarray(scores, np.float32), kind="stable")
         boxes, scores, class_id = np.asarray(boxes)[order], np.asarray(scores)[order], np.asarray(class_id)[order]
         right = np.zeros(len(boxes), np.uint16)

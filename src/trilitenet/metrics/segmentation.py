@@ -30,6 +30,7 @@ __all__ = [
     "SegmentationMetric",
     "SegmentationScores",
     "as_binary",
+    "check_valid",
     "confusion",
     "confusion_figures",
 ]
@@ -43,7 +44,13 @@ def as_binary(mask: NDArray[Any], valid: NDArray[np.bool_] | None = None) -> NDA
     Args:
         mask: (H, W) bool, or uint8 where above 0 is foreground.
         valid: (H, W) bool.
+
+    Raises:
+        ShapeError: If the mask is of another type, or ``valid`` of another type or size.
     """
+    if mask.dtype not in (np.bool_, np.uint8):
+        raise ShapeError(f"a mask must be bool or uint8, got {mask.dtype}")
+    check_valid(mask, valid)
     if mask.dtype == np.bool_:
         binary = np.ascontiguousarray(mask).view(np.uint8)
     else:
@@ -51,6 +58,16 @@ def as_binary(mask: NDArray[Any], valid: NDArray[np.bool_] | None = None) -> NDA
     if valid is not None:
         binary = np.asarray(cv2.bitwise_and(binary, np.ascontiguousarray(valid).view(np.uint8)), np.uint8)
     return binary
+
+
+def check_valid(mask: NDArray[Any], valid: NDArray[np.bool_] | None) -> None:
+    """Check which pixels of an (H, W) mask count.
+
+    Raises:
+        ShapeError: If they are not None or (H, W) bool.
+    """
+    if valid is not None and (valid.dtype != np.bool_ or valid.shape != mask.shape):
+        raise ShapeError(f"valid must be {mask.shape} bool like the mask, got {valid.shape} {valid.dtype}")
 
 
 def confusion(

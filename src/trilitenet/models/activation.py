@@ -46,24 +46,40 @@ class PReLU(nn.PReLU):
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the activation."""
-        if _by_rows(x):
+        if self.num_parameters == x.shape[1] and _by_rows(x):
             apply: Any = _RowPReLU.apply
             out: Tensor = apply(x, self.weight)
             return out
         return super().forward(x)
 
 
-def batch_norm_prelu(bn: nn.BatchNorm2d, act: nn.PReLU, x: Tensor) -> Tensor:
-    """Return ``act(bn(x))``: (B, C, H, W) -> (B, C, H, W)."""
+def batch_norm_prelu(bn: nn.Module, act: nn.Module, x: Tensor) -> Tensor:
+    """Return ``act(bn(x))``: (B, C, H, W) -> (B, C, H, W), whatever the two are."""
     worthwhile = x.dtype.itemsize >= 4 or x.shape[1] <= NARROW
-    if bn.training and worthwhile and _by_rows(x) and bn.num_batches_tracked is not None:
+    if (
+        type(bn) is nn.BatchNorm2d
+        and isinstance(act, nn.PReLU)
+        and act.num_parameters == x.shape[1]
+        and bn.training
+        and bn.affine
+        and bn.num_batches_tracked is not None
+        and bn.momentum is not None
+        and worthwhile
+        and _by_rows(x)
+        and not (_has_hooks(bn) or _has_hooks(act))
+    ):
         bn.num_batches_tracked.add_(1)
-        assert bn.momentum is not None
         apply: Any = _RowBatchNormPReLU.apply
         out: Tensor = apply(x, bn.weight, bn.bias, act.weight, bn.running_mean, bn.running_var, bn.momentum, bn.eps)
         return out
     activated: Tensor = act(bn(x))
     return activated
+
+
+def _has_hooks(module: nn.Module) -> bool:
+    return bool(
+        module._forward_hooks or module._forward_pre_hooks or module._backward_hooks or module._backward_pre_hooks
+    )
 
 
 def _by_rows(x: Tensor) -> bool:

@@ -23,11 +23,12 @@ def count_multiply_adds(network: nn.Module, size: tuple[int, int] = (384, 640)) 
     """
     parameter = next(network.parameters())
     image = torch.zeros(1, 3, *size, device=parameter.device, dtype=parameter.dtype)
-    training = network.training
+    training = [(module, module.training) for module in network.modules()]
     network.eval()
     try:
         with torch.no_grad(), FlopCounterMode(display=False) as counter:
             network(image)
     finally:
-        network.train(training)
+        for module, mode in training:  # one by one: parts may be frozen
+            module.training = mode
     return int(counter.get_total_flops()) // 2

@@ -90,7 +90,7 @@ class TriLiteNet(nn.Module):
         self.reduce = ConvBNPReLU(c4, c2) if segments else None
         self.drivable = SegmentationHead(c0, c1, c2) if "drivable" in tasks else None
         self.lane = SegmentationHead(c0, c1, c2) if "lane" in tasks else None
-        self.register_buffer("anchors", torch.tensor(anchors, dtype=torch.float32).view(len(STRIDES), -1, 2))
+        self.register_buffer("anchors", torch.as_tensor(anchors, dtype=torch.float32).clone().view(len(STRIDES), -1, 2))
         self.card = ModelCard(
             variant=variant,
             class_names=("vehicle",) if classes == 1 else tuple(f"class_{i}" for i in range(classes)),
@@ -108,7 +108,8 @@ class TriLiteNet(nn.Module):
         Raises:
             ShapeError: If the shape is another.
         """
-        if image.ndim != 4 or image.shape[1] != 3 or image.shape[2] % MAX_STRIDE or image.shape[3] % MAX_STRIDE:
+        fits = image.ndim == 4 and image.shape[1] == 3 and 0 not in image.shape
+        if not fits or image.shape[2] % MAX_STRIDE or image.shape[3] % MAX_STRIDE:
             raise ShapeError(
                 f"the network takes (B, 3, H, W) with H and W multiples of {MAX_STRIDE}, got {tuple(image.shape)}; "
                 "letterbox the image first"
@@ -176,7 +177,9 @@ def build_network(
     if isinstance(tasks, str):
         tasks = (tasks,)
     blocks = tuple(name for name, on in (("pcaa", pcaa), ("litepan", litepan), ("spp", spp)) if on)
-    return TriLiteNet(variant, classes, check_tasks(tuple(tasks)), blocks, anchors or DEFAULT_ANCHORS)
+    return TriLiteNet(
+        variant, classes, check_tasks(tuple(tasks)), blocks, DEFAULT_ANCHORS if anchors is None else anchors
+    )
 
 
 def normalise_images(
@@ -196,4 +199,4 @@ def normalise_images(
     """
     scale = torch.tensor([1 / (255 * s) for s in std], device=images.device).view(3, 1, 1)
     shift = torch.tensor([-m / s for m, s in zip(mean, std, strict=True)], device=images.device).view(3, 1, 1)
-    return images.float().mul_(scale).add_(shift)
+    return images.to(torch.float32, copy=True).mul_(scale).add_(shift)

@@ -22,7 +22,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from trilitenet.config import STRIDES, VARIANTS, Anchors, ModelCard, get_variant
-from trilitenet.errors import OutputError, WeightsError, replacing
+from trilitenet.errors import ConfigError, OutputError, WeightsError, replacing
 from trilitenet.models.trilitenet import TriLiteNet, build_network
 
 __all__ = [
@@ -113,9 +113,13 @@ def save_network(network: TriLiteNet, path: str | os.PathLike[str], card: ModelC
         half: Store floating-point tensors as fp16 (half the size).
 
     Raises:
+        ConfigError: If the card has another number of classes than the network.
+        WeightsError: If a value is not finite.
         OutputError: If the file cannot be written.
     """
     path = Path(path)
+    if "detection" in network.tasks and card.classes != network.classes:
+        raise ConfigError(f"{path}: the card has {card.classes} classes, the network {network.classes}")
     card = dataclasses.replace(
         card,
         variant=network.variant,
@@ -128,7 +132,12 @@ def save_network(network: TriLiteNet, path: str | os.PathLike[str], card: ModelC
         if name == "anchors" or name.endswith("num_batches_tracked"):
             continue
         data = tensor.detach().to("cpu").contiguous()
-        tensors[name] = data.half() if half and data.is_floating_point() else data.clone()
+        data = data.half() if half and data.is_floating_point() else data.clone()
+        if not data.isfinite().all():
+            raise WeightsError(
+                f"{path}: not written, {name} holds values that are not finite{' in fp16' if half else ''}"
+            )
+        tensors[name] = data
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as part:

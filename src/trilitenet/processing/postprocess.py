@@ -76,13 +76,13 @@ def select_boxes(detection: NDArray[np.float32], letterbox: Letterbox, threshold
     keep = scores > thresholds.confidence
     candidates, class_id, scores = candidates[keep], class_id[keep], scores[keep]
     xyxy = cxcywh_to_xyxy(candidates[:, :4])
-    kept = nms(xyxy, scores, class_id, thresholds.iou, thresholds.max_boxes)
-    source = letterbox.boxes_to_source(xyxy[kept])
-    visible = (source[:, 2] > source[:, 0]) & (source[:, 3] > source[:, 1])
+    source = letterbox.boxes_to_source(xyxy)
+    visible = ((source[:, 2] > source[:, 0]) & (source[:, 3] > source[:, 1])).nonzero()[0]
+    kept = visible[nms(xyxy[visible], scores[visible], class_id[visible], thresholds.iou, thresholds.max_boxes)]
     return Boxes(
-        xyxy=source[visible],
-        confidence=np.minimum(scores[kept][visible], 1.0).astype(np.float32),
-        class_id=class_id[kept][visible].astype(np.int64),
+        xyxy=source[kept],
+        confidence=np.minimum(scores[kept], 1.0).astype(np.float32),
+        class_id=class_id[kept].astype(np.int64),
     )
 
 
