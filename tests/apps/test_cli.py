@@ -167,3 +167,13 @@ def test_the_values_that_may_follow_are_those_that_there_are() -> None:
 
     assert set(cli._LISTS["--backend"].split("|")) == set(BACKENDS)
     assert set(cli._LISTS["--precisions"].split("|")) == set(get_args(Precision))
+
+
+def test_an_unknown_level_of_the_log_is_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TRILITENET_LOG", "loud")
+    assert main(["--version"]) == 1
+    assert capsys.readouterr().err == (
+        "error: TRILITENET_LOG=LOUD is no level of a log; take DEBUG, INFO, WARNING or ERROR\n"
+    )

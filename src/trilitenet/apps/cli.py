@@ -25,7 +25,7 @@ import cyclopts
 from cyclopts.exceptions import CycloptsError, UnknownOptionError, UnusedCliTokensError
 
 import trilitenet
-from trilitenet.errors import TriLiteNetError, did_you_mean
+from trilitenet.errors import ConfigError, TriLiteNetError, did_you_mean
 
 __all__ = ["COMMANDS", "GROUPS", "Command", "build_app", "main"]
 
@@ -157,11 +157,12 @@ def main(words: Sequence[str] | None = None) -> int:
     """
     # A lone "-" is standard input, not an option without a name.
     words = ["stdin" if word == "-" else word for word in (sys.argv[1:] if words is None else words)]
-    logging.basicConfig(
-        level=os.environ.get("TRILITENET_LOG", "WARNING").upper(),
-        format="%(levelname)s %(name)s: %(message)s",
-    )
+    level = os.environ.get("TRILITENET_LOG", "WARNING").upper()
+    known = level in {"DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"}
+    logging.basicConfig(level=level if known else "WARNING", format="%(levelname)s %(name)s: %(message)s")
     try:
+        if not known:
+            raise ConfigError(f"TRILITENET_LOG={level} is no level of a log; take DEBUG, INFO, WARNING or ERROR")
         _check_command(words)
         words = _repeated(words)
         app = build_app(words)

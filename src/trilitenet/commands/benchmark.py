@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 import trilitenet
 from trilitenet.commands.load import load
+from trilitenet.commands.paths import text_paths
 from trilitenet.config import VARIANTS, check_size
 from trilitenet.errors import ConfigError, OutputError, import_extra, writing
 from trilitenet.inference.predictor import Predictor
@@ -125,6 +126,7 @@ class Benchmark:
         return "\n".join(lines)
 
 
+@text_paths
 def benchmark(
     *models: str,
     backend: Sequence[str] = ("auto",),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from trilitenet.commands.paths import text_paths
 from trilitenet.engine.compare import Comparison, compare_reports
 from trilitenet.engine.report import Report, read_report
 from trilitenet.errors import ConfigError, OutputError
@@ -11,6 +12,7 @@ from trilitenet.errors import ConfigError, OutputError
 __all__ = ["compare"]
 
 
+@text_paths
 def compare(
     *reports: Path,
     published: bool = False,

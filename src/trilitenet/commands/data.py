@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import io
 import json
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,6 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from trilitenet.commands.paths import text_paths
 from trilitenet.data.check_page import check_page, picture_page
 from trilitenet.data.checking import KINDS, CheckReport, check_dataset, detect_layout
 from trilitenet.data.contact_sheet import contact_sheet, draw_sample, pick
@@ -75,6 +77,7 @@ class Converted:
         return "\n".join([*lines, f"written to {self.output}"])
 
 
+@text_paths
 def convert(
     source: str,
     output: Path,
@@ -184,7 +187,8 @@ class Checked:
         few = {key: values for key, values in report.conditions.items() if len(values) <= 12}
         for key, values in few.items():
             lines.append(f"{key}: " + ", ".join(f"{value} {sum(n.values())}" for value, n in values.items()))
-        lines.append(f"best possible recall of the anchors: {report.anchor_recall:.2%}")
+        recall = "no boxes" if math.isnan(report.anchor_recall) else f"{report.anchor_recall:.2%}"
+        lines.append(f"best possible recall of the anchors: {recall}")
         if report.findings:
             faults = Table("kind", "split", "count", "what", "for example")
             for finding in report.findings:
@@ -197,6 +201,7 @@ class Checked:
         return "\n".join([*lines, *(f"written: {path}" for path in self.files)])
 
 
+@text_paths
 def check(
     root: Path,
     *,
@@ -247,6 +252,7 @@ class Shown:
         return f"{self.count} images on {self.output}"
 
 
+@text_paths
 def show(
     root: Path,
     output: Path,
@@ -336,6 +342,7 @@ class Prepared:
         return f"{counts} in {self.output} ({self.size / 2**20:.1f} MiB); {use}"
 
 
+@text_paths
 def prepare(
     root: Path,
     output: Path | None = None,

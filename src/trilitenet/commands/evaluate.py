@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from trilitenet.commands.load import load
+from trilitenet.commands.paths import text_paths
 from trilitenet.config import ArtefactInfo
 from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER, DrivingDataset
 from trilitenet.engine.evaluate import EvaluatedPredictor
@@ -26,6 +27,7 @@ from trilitenet.processing.corruptions import SEVERITIES
 __all__ = ["evaluate", "hash_dataset", "hash_model", "write_report"]
 
 
+@text_paths
 def evaluate(
     model: str = "tiny",
     /,

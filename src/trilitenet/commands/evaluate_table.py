@@ -18,6 +18,7 @@ from trilitenet.commands.export import (
     export,
     find_pictures,
 )
+from trilitenet.commands.paths import text_paths
 from trilitenet.commands.tables import markdown_row
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.provenance import hash_files
@@ -107,6 +108,7 @@ class PrecisionTable:
         return lines
 
 
+@text_paths
 def evaluate_table(
     *models: str,
     data: Path,

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 import trilitenet
+from trilitenet.commands.paths import text_paths
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, MAX_STRIDE, ArtefactInfo, Task, check_size
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.deploy.graph import DeployGraph, Masks
@@ -108,6 +109,7 @@ class Exported:
         return "\n".join((*lines, *self.notes))
 
 
+@text_paths
 def export(
     model: str = "tiny",
     /,

@@ -20,6 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.text import Text
 
 from trilitenet.commands.load import load
+from trilitenet.commands.paths import text_paths
 from trilitenet.errors import BackendError, InputError, OutputError, ShapeError, replacing, writing
 from trilitenet.formats.writers.base import Writer, find_writer, open_writer
 from trilitenet.inference.predictor import Predictor
@@ -118,6 +119,7 @@ class PredictReport:
         return f"{'interrupted: ' if self.interrupted else ''}{what}{failed}"
 
 
+@text_paths
 def predict(
     *sources: str,
     output: Path = Path("predictions"),
@@ -152,7 +154,7 @@ def predict(
         sources: Pictures, videos, folders, glob patterns, numbered pictures (frames/%06d.jpg), RTSP or HTTP URLs, a
             camera's number (0), - for a video on standard input.
         output: Folder for the results.
-        model: Name of shipped weights, or a file of weights.
+        model: Name of shipped weights, a weight file, or an exported artefact of any runtime.
         device: auto (the best there is), cpu, cuda, cuda:1, mps.
         backend: auto (what the file is for), or a runtime by name.
         confidence: Keep boxes whose confidence is above this, in [0, 1]; the model's own if left out.

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from trilitenet.commands.evaluate import check_counts, check_output, hash_dataset, write_report
+from trilitenet.commands.paths import text_paths
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.evaluate import score_predictions
 from trilitenet.engine.predictions import DETECTIONS_FILE, SavedPredictions
@@ -17,6 +18,7 @@ from trilitenet.engine.scorecard import CONDITIONS
 __all__ = ["score"]
 
 
+@text_paths
 def score(
     predictions: Path,
     /,

@@ -8,6 +8,7 @@ from typing import Literal
 
 from rich.progress import track
 
+from trilitenet.commands.paths import text_paths
 from trilitenet.data.synthetic_files import write_dataset
 
 __all__ = ["Synthesized", "synthesize"]
@@ -32,6 +33,7 @@ class Synthesized:
         return f"{self.count} scenes in {self.output} (split {self.split})"
 
 
+@text_paths
 def synthesize(
     output: Path,
     *,

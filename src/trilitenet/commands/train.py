@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from trilitenet.commands.paths import text_paths
 from trilitenet.config import DEFAULT_ANCHORS, ModelCard
 from trilitenet.data.loader import build_loader
 from trilitenet.data.prepared import PreparedDataset, is_prepared, open_dataset
@@ -51,6 +52,7 @@ _YAML_FLAGS: Final = ("anchors", "sampling", "extra_data")
 """Fields whose flag takes YAML, for example --sampling '{timeofday: {night: 2}}'."""
 
 
+@text_paths
 def train(
     recipe: Path | None = None, /, *, resume: bool = False, overwrite: bool = False, **fields: Any
 ) -> TrainResult:

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import yaml
 
+from trilitenet.commands.paths import text_paths
 from trilitenet.commands.tables import markdown_row
 from trilitenet.commands.train import train
 from trilitenet.config import read_yaml
@@ -74,6 +75,7 @@ class TableResult:
         return "\n".join(lines)
 
 
+@text_paths
 def train_table(table: Path, /, *, data: Path, output: Path, resume: bool = False, settings: str = "") -> TableResult:
     """Train every row of a table of the paper and print the table; rows that are done are not trained again.
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from trilitenet.commands.load import load
+from trilitenet.commands.paths import text_paths
 from trilitenet.config import ModelCard, check_size, parse, read_yaml
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.evaluate import best_thresholds
@@ -37,6 +38,7 @@ class CardText:
     notes: tuple[str, ...] = ()
 
 
+@text_paths
 def import_weights(
     source: Path, destination: Path, /, *, variant: str | None = None, overwrite: bool = False
 ) -> ModelCard:
@@ -58,6 +60,7 @@ def import_weights(
     return card
 
 
+@text_paths
 def finish(
     source: str,
     destination: Path,

@@ -195,10 +195,16 @@ class VideoWriter:
     """
 
     def __init__(
-        self, path: Path, rate: float | None = None, *, quality: int = 23, preset: str = "superfast", ahead: int = 8
+        self,
+        path: str | Path,
+        rate: float | None = None,
+        *,
+        quality: int = 23,
+        preset: str = "superfast",
+        ahead: int = 8,
     ) -> None:
         self._av = import_extra("av", "video")
-        self.path = path
+        self.path = path = Path(path)
         self.frames = 0
         self._partial = path.with_name(f"{path.name}.part")
         self._rate = rate or 30.0

@@ -1,6 +1,6 @@
 """What every writer is: it takes perceptions one by one and leaves files of one format.
 
-    with open_writer("coco", Path("results")) as writer:
+    with open_writer("coco", "results") as writer:
         for perception in perceptions:
             writer.write(perception)
     print(writer.files)
@@ -169,7 +169,7 @@ class Writer(abc.ABC):
         return name if owner == perception.source else PurePath(perception.source).as_posix()
 
 
-def open_writer(format: str, output: Path, *, overwrite: bool = False, **options: Any) -> Writer:
+def open_writer(format: str, output: str | Path, *, overwrite: bool = False, **options: Any) -> Writer:
     """Return the writer of a format.
 
     Args:
@@ -182,7 +182,7 @@ def open_writer(format: str, output: Path, *, overwrite: bool = False, **options
         ConfigError: If the format is unknown.
         MissingExtraError: If the format needs a package that is not installed.
     """
-    return find_writer(format)(output, overwrite=overwrite, **options)
+    return find_writer(format)(Path(output), overwrite=overwrite, **options)
 
 
 def find_writer(format: str) -> type[Writer]:

@@ -1,0 +1,42 @@
+"""Let text stand for a path in the Python API; the command line makes paths of its own."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+__all__ = ["text_paths"]
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+def text_paths(function: _Function) -> _Function:
+    """Return the function so that arguments annotated as paths, and not as texts too, may be texts.
+
+    Args:
+        function: Of a module with postponed annotations.
+    """
+    signature = inspect.signature(function)
+    names = {
+        name
+        for name, parameter in signature.parameters.items()
+        if "Path" in str(parameter.annotation) and "str" not in str(parameter.annotation)
+    }
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        bound = signature.bind(*args, **kwargs)
+        for name in names & bound.arguments.keys():
+            bound.arguments[name] = _as_path(bound.arguments[name])
+        return function(*bound.args, **bound.kwargs)
+
+    return cast(_Function, call)
+
+
+def _as_path(value: Any) -> Any:
+    if isinstance(value, str):
+        return Path(value)
+    return [_as_path(one) for one in value] if isinstance(value, (list, tuple)) else value
