@@ -173,7 +173,7 @@ def test_an_unknown_level_of_the_log_is_one_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TRILITENET_LOG", "loud")
-    assert main(["--version"]) == 1
+    assert cli.main(["--version"]) == 1
     assert capsys.readouterr().err == (
         "error: TRILITENET_LOG=LOUD is no level of a log; take DEBUG, INFO, WARNING or ERROR\n"
     )
