@@ -79,6 +79,7 @@ def test_an_interruption_is_130(greet: list[object]) -> None:
             "error: unknown option --loudnes; did you mean '--loudness'? (see: trilitenet greet --help)\n",
         ),
         (["greet"], 'error: Command "greet" parameter --name requires an argument (see: trilitenet greet --help)\n'),
+        (["greet", "a", "--nonsense"], "error: unknown option --nonsense (see: trilitenet greet --help)\n"),
         (["greet", "a", "--louder=3"], None),
         (["greet", "a", "1", "2"], None),
         (["greet", "a", "--loudness", "much"], None),

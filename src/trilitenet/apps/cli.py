@@ -215,7 +215,8 @@ def _one_line(error: CycloptsError) -> str:
     if isinstance(error, UnknownOptionError):
         option = (error.token.keyword or error.token.value).partition("=")[0]
         known = [name for argument in error.argument_collection if argument.parse for name in argument.names]
-        near = did_you_mean(option, known)
+        # Compared without the dashes, which would make any two options alike.
+        near = did_you_mean(option.lstrip("-"), [name.lstrip("-") for name in known]).replace("'", "'--", 1)
         text = f"unknown option {option}" + (near if near.endswith("?") else "")
     elif isinstance(error, UnusedCliTokensError):
         text = f"unexpected {' '.join(error.unused_tokens or ())}"
