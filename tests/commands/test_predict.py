@@ -353,7 +353,7 @@ from trilitenet.inference.predictor import Predictor
 
 class Slow(ColourBackend):
     def run(self, batch):
-        time.sleep(0.05)
+        time.sleep(0.5)
         return super().run(batch)
 
 report = predict_with(Predictor(Slow(), batch_size=1), [{str(source)!r}], Path({str(output)!r}))
