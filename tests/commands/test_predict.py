@@ -345,7 +345,7 @@ def test_names_that_no_file_can_have_are_failures_of_their_own(
 def test_ctrl_c_in_a_process_of_its_own(tmp_path: Path) -> None:
     source, output = drive(tmp_path / "drive.mp4", frames=600), tmp_path / "out"
     script = f"""
-import sys, time
+import signal, sys, time
 from pathlib import Path
 from tests.fakes import ColourBackend
 from trilitenet.commands.predict import predict_with
@@ -353,9 +353,10 @@ from trilitenet.inference.predictor import Predictor
 
 class Slow(ColourBackend):
     def run(self, batch):
-        time.sleep(0.5)
+        time.sleep(0.1)
         return super().run(batch)
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore it
 report = predict_with(Predictor(Slow(), batch_size=1), [{str(source)!r}], Path({str(output)!r}))
 print(report.summary())
 sys.exit(report.exit_code)
