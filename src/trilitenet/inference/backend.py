@@ -21,14 +21,21 @@ MOST_PARALLEL: Final = 4
 """At most so many images are computed at once where a backend trades latency for images a second."""
 
 
-def check_batch(batch: NDArray[np.uint8]) -> None:
+def check_batch(batch: NDArray[np.uint8], stride: int = 1) -> None:
     """Check what `Backend.run` takes.
 
+    Args:
+        batch: The images.
+        stride: H and W must be multiples of so many pixels.
+
     Raises:
-        ShapeError: If it is not (B, H, W, 3) uint8, or empty.
+        ShapeError: If it is not (B, H, W, 3) uint8, or empty, or of other sides.
     """
     if batch.ndim != 4 or batch.shape[3] != 3 or batch.dtype != np.uint8 or 0 in batch.shape:
         raise ShapeError(f"a batch must be (B, H, W, 3) uint8 with B >= 1, got {batch.shape} {batch.dtype}")
+    height, width = batch.shape[1:3]
+    if height % stride or width % stride:
+        raise ShapeError(f"the sides of images must be multiples of {stride} pixels, got {width}x{height}")
 
 
 _REPLACING: Final = threading.Lock()

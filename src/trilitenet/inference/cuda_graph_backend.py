@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from trilitenet.config import MAX_STRIDE, TASKS, ModelCard
-from trilitenet.errors import BackendError, ShapeError
+from trilitenet.errors import BackendError
+from trilitenet.inference.backend import check_batch
 from trilitenet.inference.torch_backend import pick_device
 from trilitenet.structures import RawOutputs
 
@@ -82,8 +83,7 @@ class CudaGraphBackend:
 
     def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
         """Run the network on (B, H, W, 3) uint8 RGB; see `Backend.run`."""
-        if batch.ndim != 4 or batch.shape[3] != 3 or batch.shape[1] % MAX_STRIDE or batch.shape[2] % MAX_STRIDE:
-            raise ShapeError(f"images must be (B, H, W, 3) with H and W multiples of {MAX_STRIDE}, got {batch.shape}")
+        check_batch(batch, MAX_STRIDE)
         with self._lock, torch.cuda.device(self.device), torch.inference_mode():
             try:
                 captured = self._get(batch.shape)

@@ -89,10 +89,7 @@ def run_images(
         ShapeError: If the batch is empty, or of another shape or type, or of a size the artefact cannot take.
         BackendError: If the runtime fails.
     """
-    check_batch(batch)
-    height, width = batch.shape[1:3]
-    if info.size is None and (min(height, width) < MAX_STRIDE or height % MAX_STRIDE or width % MAX_STRIDE):
-        raise ShapeError(f"the sides of images must be multiples of {MAX_STRIDE} pixels, got {width}x{height}")
+    check_batch(batch, MAX_STRIDE if info.size is None else 1)
     try:
         results = outputs()
     except TriLiteNetError:
