@@ -92,9 +92,10 @@ def brief(error: BaseException) -> str:
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return ``"; did you mean 'x'?"`` for the nearest known word, or the list of what is known."""
-    names = sorted(known)
-    near = difflib.get_close_matches(word, names, n=1)
-    return f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(names)}"
+    # Compared without an option's dashes, which would make any two options alike.
+    names = {name.lstrip("-"): name for name in sorted(known)}
+    near = difflib.get_close_matches(word.lstrip("-"), names, n=1)
+    return f"; did you mean {names[near[0]]!r}?" if near else f"; known: {', '.join(names.values())}"
 
 
 def import_extra(module: str, extra: str) -> ModuleType:

@@ -158,7 +158,7 @@ def main(words: Sequence[str] | None = None) -> int:
     # A lone "-" is standard input, not an option without a name.
     words = ["stdin" if word == "-" else word for word in (sys.argv[1:] if words is None else words)]
     level = os.environ.get("TRILITENET_LOG", "WARNING").upper()
-    known = level in {"DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"}
+    known = isinstance(logging.getLevelName(level), int)  # of a name it gives the number
     logging.basicConfig(level=level if known else "WARNING", format="%(levelname)s %(name)s: %(message)s")
     try:
         if not known:
@@ -215,8 +215,7 @@ def _one_line(error: CycloptsError) -> str:
     if isinstance(error, UnknownOptionError):
         option = (error.token.keyword or error.token.value).partition("=")[0]
         known = [name for argument in error.argument_collection if argument.parse for name in argument.names]
-        # Compared without the dashes, which would make any two options alike.
-        near = did_you_mean(option.lstrip("-"), [name.lstrip("-") for name in known]).replace("'", "'--", 1)
+        near = did_you_mean(option, known)
         text = f"unknown option {option}" + (near if near.endswith("?") else "")
     elif isinstance(error, UnusedCliTokensError):
         text = f"unexpected {' '.join(error.unused_tokens or ())}"
