@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from trilitenet.commands.evaluate import check_counts
 from trilitenet.commands.paths import text_paths
 from trilitenet.engine.compare import Comparison, compare_reports
 from trilitenet.engine.report import Report, read_report
@@ -34,8 +35,7 @@ def compare(
     """
     if not reports:
         raise ConfigError("give at least one report.json, or a folder that holds one")
-    if resamples < 0:
-        raise ConfigError(f"--resamples must not be negative, got {resamples}; 0 is for none")
+    check_counts(resamples)
     if output is not None and not overwrite and (output / "comparison.json").exists():
         raise OutputError(f"{output}: holds comparison.json already; give another folder or --overwrite")
     named: dict[str, Report] = {}

@@ -39,7 +39,7 @@ from trilitenet.data.lane_edges import centre_line, pair_edges
 from trilitenet.data.rasterise import draw_line, fill_polygon
 from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, IMAGE_FOLDER, LANE_FOLDER
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel, RecordSource, RunLabel
-from trilitenet.errors import ConfigError, DataError, OutputError, writing
+from trilitenet.errors import ConfigError, DataError, OutputError, replacing, writing
 
 __all__ = ["ConversionOptions", "ConversionReport", "convert", "drivable_mask", "lane_mask"]
 
@@ -429,9 +429,8 @@ def _write(path: Path, data: bytes) -> None:
             return
     except FileNotFoundError:
         pass
-    part = path.with_name(f".{path.name}.part")
-    part.write_bytes(data)
-    part.replace(path)
+    with replacing(path) as part:
+        part.write_bytes(data)
 
 
 def _rewrite(path: Path, text: str) -> None:
