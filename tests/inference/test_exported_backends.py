@@ -138,6 +138,23 @@ def test_a_predictor_goes_to_other_processes(artefacts: Artefacts, name: str, ki
         np.testing.assert_array_equal(other.lane, one.lane)
 
 
+def test_signals_may_come_after_models_were_dropped(artefacts: Artefacts) -> None:
+    program = f"""
+import gc, os, signal
+from trilitenet.inference.openvino_backend import OpenVINOBackend
+first, second = [OpenVINOBackend({str(artefacts.folder / "model.xml")!r}) for _ in range(2)]
+del first
+gc.collect()
+del second
+gc.collect()
+caught = []
+signal.signal(signal.SIGUSR1, lambda *_: caught.append(1))
+os.kill(os.getpid(), signal.SIGUSR1)
+assert caught
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+
+
 def test_a_closed_model_says_so(artefacts: Artefacts) -> None:
     backend = OpenVINOBackend(artefacts.folder / "model.xml")
     backend.close()

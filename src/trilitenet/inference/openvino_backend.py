@@ -24,7 +24,7 @@ from trilitenet.structures import RawOutputs
 
 __all__ = ["OpenVINOBackend"]
 
-_FIRST_TENSOR = threading.Lock()
+_FIRST_USE = threading.Lock()
 _HINTS = {"fp32": "f32", "fp16": "f16", "bf16": "bf16"}
 
 
@@ -59,10 +59,6 @@ class OpenVINOBackend:
         threads: int | None = None,
     ) -> None:
         openvino = import_extra("openvino", "openvino")
-        with _FIRST_TENSOR:
-            # The first tensor of a process sets up NumPy for OpenVINO's binding; two threads that do so at once wait
-            # for each other for ever.
-            openvino.Tensor(np.zeros(1, np.uint8))
         path = Path(path)
         if not path.is_file():
             raise WeightsError(f"{path}: no such file")
@@ -73,7 +69,8 @@ class OpenVINOBackend:
         # Checked here because OpenVINO tries every reader it has on a foreign file, and some of them talk.
         if not start.startswith(b"\x08" if path.suffix.lower() == ".onnx" else b"<"):
             raise WeightsError(f"{path}: not a usable OpenVINO or ONNX model (it does not begin as one)")
-        core = openvino.Core()
+        with _FIRST_USE:
+            core = _core(openvino)
         try:
             model = core.read_model(path)
         except RuntimeError as error:
@@ -189,6 +186,20 @@ class OpenVINOBackend:
     def close(self) -> None:
         """Free the compiled model's requests."""
         self._idle = None
+
+
+@functools.cache
+def _core(openvino: Any) -> Any:
+    """Return the process's one core, which lives as long as the process.
+
+    A core's CPU plugin gives its thread another stack for signals and, when it goes, the stack that it found. Of two
+    cores that go in the order in which they came, the second gives back the memory that the first has freed, and the
+    next signal that Python handles (Ctrl-C, the end of a child) kills the process.
+    """
+    # The first tensor of a process sets up NumPy for OpenVINO's binding; two threads that do so at once wait for each
+    # other for ever.
+    openvino.Tensor(np.zeros(1, np.uint8))
+    return openvino.Core()
 
 
 def _requests(compiled: Any, count: int) -> queue.SimpleQueue[Any]:
