@@ -264,7 +264,7 @@ def test_the_drop_is_that_of_the_worst_of_all_tasks(
     assert set(command.DROP_SCORES.values()) <= set(FIGURES)
     write_dataset(tmp_path / "data", "val", 2, 0, size=(96, 160))
     network = load_network(artefacts.folder / "weights.safetensors")
-    losses = iter([0.0, 0.02])
+    losses = iter([0.0, 0.02, 0.03])
     canvases = []
 
     def worse(predictor: Predictor, *arguments: Any, **options: Any) -> Report:
@@ -276,10 +276,12 @@ def test_the_drop_is_that_of_the_worst_of_all_tasks(
 
     monkeypatch.setattr(command, "evaluate", worse)
     path = export(str(artefacts.folder / "weights.safetensors"), output=tmp_path / "a.onnx", size="96x160").path
-    assert command._measure_drop(network, OnnxBackend(path), tmp_path / "data") == pytest.approx(2.0)
-    assert canvases == [(96, 160), (96, 160)]
+    drop = command._Drop(network, (96, 160), tmp_path / "data")
+    assert drop.measure(OnnxBackend(path)) == pytest.approx(2.0)
+    assert drop.measure(OnnxBackend(path)) == pytest.approx(3.0)
+    assert canvases == [(96, 160)] * 3  # the network is looked at once
     monkeypatch.undo()
     for labels in ("det_annotations", "da_seg_annotations", "ll_seg_annotations"):
         shutil.rmtree(tmp_path / "data" / labels)
     with pytest.raises(ConfigError, match="--max-drop needs labels"):
-        command._measure_drop(network, OnnxBackend(path), tmp_path / "data")
+        command._Drop(network, (96, 160), tmp_path / "data")

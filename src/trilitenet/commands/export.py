@@ -256,14 +256,15 @@ def export(
         return _keep(network, built, info, path, checks)
     assert calibration is not None
     inputs = [_as_input(image, info) for image in _canvases(calibration, canvas, calibration_frames, split="train")]
+    budget = None if max_drop is None else _Drop(network, info.size, calibration)
     quantize = quantize_openvino if format == "openvino" else quantize_onnx
     reason = ""
-    for keep in KEEP_STEPS if max_drop is not None else KEEP_STEPS[1:2]:
+    for keep in KEEP_STEPS if budget else KEEP_STEPS[1:2]:
         candidate = quantize(built, inputs, keep)
         with tempfile.TemporaryDirectory() as folder:
             trial = Path(folder) / path.name
             _write(candidate, trial, network, info)
-            drop = 0.0 if max_drop is None else _measure_drop(network, _open(trial, info), calibration)
+            drop = budget.measure(_open(trial, info)) if budget else 0.0
         if max_drop is None or drop <= max_drop:
             exported = _keep(network, candidate, info, path, checks)
             kept = f"in floating point: {', '.join(keep) or 'attention and depthwise convolutions only'}"
@@ -458,27 +459,29 @@ def _require(parity: Parity, path: Path) -> None:
         raise BackendError(f"{path}: not written, it differs from the network: {'; '.join(parity.failures)}")
 
 
-def _measure_drop(network: TriLiteNet, backend: Backend, data: Path) -> float:
-    """Return the largest loss of a score in points on the val split, against the float32 network."""
-    if not (data / "images" / "val").is_dir():
-        raise ConfigError(f"--max-drop needs labels; {data} is not a data set with a val split")
-    dataset = drop_frames(data, network.card.class_names)
+class _Drop:
+    """The largest loss of a score in points on the val split, against the float32 network on the same pixels."""
 
-    def scores(predictor: Predictor) -> dict[str, float]:
-        report = evaluate(predictor, dataset, resamples=0, worst=0, by=())
-        values = {
-            key: report.figures[key].value
-            for task in network.card.tasks
-            if (key := DROP_SCORES[task]) in report.figures
-        }
+    def __init__(self, network: TriLiteNet, size: tuple[int, int] | None, data: Path) -> None:
+        if not (data / "images" / "val").is_dir():
+            raise ConfigError(f"--max-drop needs labels; {data} is not a data set with a val split")
+        tasks = network.card.tasks
+        self._keys = [DROP_SCORES[task] for task in tasks]
+        self._dataset = drop_frames(data, network.card.class_names)
+        self._before = self._scores(TorchBackend(network, "cpu", size))
+        if not self._before:
+            raise ConfigError(f"--max-drop needs labels; there are none for {', '.join(tasks)} in {data}")
+
+    def measure(self, backend: Backend) -> float:
+        """Return what an artefact loses; closes its backend."""
+        after = self._scores(backend)
+        return max(100 * (value - after.get(key, 0.0)) for key, value in self._before.items())
+
+    def _scores(self, backend: Backend) -> dict[str, float]:
+        with Predictor(backend) as predictor:
+            figures = evaluate(predictor, self._dataset, resamples=0, worst=0, by=()).figures
+        values = {key: figures[key].value for key in self._keys if key in figures}
         return {key: value for key, value in values.items() if math.isfinite(value)}
-
-    with Predictor(backend) as predictor:
-        before = scores(Predictor(TorchBackend(network, "cpu", predictor.backend.canvas)))  # the same pixels for both
-        if not before:
-            raise ConfigError(f"--max-drop needs labels; there are none for {', '.join(network.card.tasks)} in {data}")
-        after = scores(predictor)
-    return max(100 * (value - after.get(key, 0.0)) for key, value in before.items())
 
 
 def _export_torch(
