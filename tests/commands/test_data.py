@@ -12,7 +12,7 @@ import pytest
 from tests.data.published import write_published
 from tests.formats.readers import raw_bdd
 from trilitenet.apps.cli import main
-from trilitenet.commands.data import check, convert, prepare, show
+from trilitenet.commands.data import _widths, check, convert, prepare, show
 from trilitenet.commands.train import _training_data
 from trilitenet.data.prepared import PreparedDataset, open_dataset
 from trilitenet.data.reading import DrivingDataset
@@ -69,6 +69,21 @@ def test_convert_wants_its_words(raw: Path, tmp_path: Path) -> None:
         convert("bdd100k", raw, tmp_path / "out", kind="bdd100k")
     with pytest.raises(ConfigError, match="lane width"):
         convert("bdd100k", raw, tmp_path / "out", lane_width=["wide"])
+    with pytest.raises(ConfigError, match="above 0 and finite, got 'train=nan'"):
+        convert("bdd100k", raw, tmp_path / "out", lane_width=["train=nan"])
+
+
+@pytest.mark.parametrize(
+    ("words", "widths"),
+    [
+        (["train=9", "4"], {"train": 9.0, "*": 4.0}),
+        (["4", "train=9"], {"train": 9.0, "*": 4.0}),
+        (["val=3"], {"train": 8.0, "*": 2.0, "val": 3.0}),
+        (["3"], {"*": 3.0}),
+    ],
+)
+def test_lane_widths_by_split_and_for_the_others(words: list[str], widths: dict[str, float]) -> None:
+    assert _widths(words) == widths
 
 
 def test_check_says_what_is_wrong(published: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -25,6 +25,8 @@ def test_synthesize_writes_the_published_layout(tmp_path: Path, capsys: pytest.C
         (["--seed", "-1"], "seed must not be negative, got -1"),
         (["--size", "0", "0"], "size must be at least 32 pixels each way"),
         (["--count", "0"], "count and workers must be at least 1"),
+        (["--split", ""], "split must be the name of one folder"),
+        (["--split", "a/b"], "split must be the name of one folder"),
     ],
 )
 def test_wrong_options_leave_nothing(

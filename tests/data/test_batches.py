@@ -56,6 +56,12 @@ def test_ego_mask_is_ignored_by_every_task() -> None:
     assert (covered & ~valid).sum() > 0.8 * (~valid).sum()
 
 
+def test_what_lies_between_ignored_areas_is_not_ignored() -> None:
+    valid = np.ones((32, 64), np.bool_)
+    valid[:4] = valid[28:] = False
+    assert collate([sample("a", valid=valid)]).ignored[:, 4].unique().tolist() == [4]
+
+
 def test_only_one_size() -> None:
     with pytest.raises(ShapeError, match="at least one"):
         collate([])

@@ -106,6 +106,7 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "truncated mask": ("mask-unreadable", lambda root: truncate(root / "ll_seg_annotations/train/train_0001.png")),
     "mask of another size": ("mask-size", lambda root: draw_mask(root, np.zeros((36, 64), np.uint8))),
     "mask values": ("mask-values", lambda root: draw_mask(root, np.full((72, 128), 77, np.uint8))),
+    "mask of 16 bits": ("mask-values", lambda root: draw_mask(root, np.full((72, 128), 255, np.uint16))),
     "mask of ones": ("mask-invisible", lambda root: draw_mask(root, np.ones((72, 128), np.uint8))),
     "swapped corners": ("box-invalid", lambda root: annotate(root, box(50, 10, 40, 30))),
     "infinite box": ("box-invalid", lambda root: annotate(root, box(50, 10, float("inf"), 30))),
@@ -125,12 +126,22 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object]]] = {
         "name-in-two-splits",
         lambda root: add_image(root, "val", "train_0000", np.random.default_rng(9).integers(0, 255, (72, 128, 3))),
     ),
+    "two endings": (
+        "name-twice",
+        lambda root: cv2.imwrite(
+            str(root / "images/train/train_0000.png"), np.random.default_rng(9).integers(0, 255, (72, 128, 3))
+        ),
+    ),
     "copy in a split": ("duplicate", lambda root: copy_image(root, "train", "copy")),
     "copy across splits": ("leak-duplicate", lambda root: copy_image(root, "val", "copied")),
     "near copy across splits": ("leak-near-duplicate", lambda root: add_image(root, "val", "near", brighter(root))),
     "sequence across splits": (
         "leak-sequence",
         lambda root: (root / "index.csv").write_text((root / "index.csv").read_text().replace("sval1", "strain1")),
+    ),
+    "index is not UTF-8": (
+        "index",
+        lambda root: (root / "index.csv").write_bytes("name,split\nstraße,train\n".encode("latin-1")),
     ),
     "index names no image": ("index", lambda root: (root / "index.csv").open("a").write("nobody,train,x\n")),
     "no such split": ("split-missing", lambda root: (root / "dataset.yaml").write_text("splits: [train, val, test]\n")),
@@ -160,7 +171,8 @@ def test_all_kinds_are_planted() -> None:
 
 ONE_PLACE = (
     "swapped corners", "infinite box", "box outside", "box twice", "unknown category",
-    "mask values", "mask of another size", "no label at all", "one name twice",
+    "mask values", "mask of 16 bits", "mask of another size", "no label at all", "one name twice", "two endings",
+    "index is not UTF-8",
 )  # fmt: skip
 """Faults planted in the same file as another, so that only the last one would be there."""
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from tests.data.published import write_published
 from trilitenet.data.batches import Batch
 from trilitenet.data.loader import build_loader, epoch_order
 from trilitenet.data.reading import DrivingDataset, MixedDataset
+from trilitenet.data.sample import Sample
 from trilitenet.data.transforms import Augmentation, EvalTransform, TrainTransform
 from trilitenet.errors import ConfigError, DataError
 
@@ -113,6 +115,19 @@ def test_weights_of_mixed_data_sets_are_used(dataset: DrivingDataset) -> None:
     assert names[dataset.names[0]] >= 3
     equal = build_loader(MixedDataset([(rare, 2.0), (dataset, 2.0)]), EvalTransform(CANVAS), batch_size=2)
     assert set(Counter(name for batch in equal.epoch(0) for name in batch.names).values()) == {1, 2}
+
+
+def test_what_is_left_out_is_not_mixed_in_either(dataset: DrivingDataset) -> None:
+    mixed: set[str] = set()
+
+    def transform(sample: Sample, rng: np.random.Generator, other: Callable[[np.random.Generator], Sample]) -> Sample:
+        mixed.update(other(rng).name for _ in range(30))
+        return EvalTransform(CANVAS)(sample, rng, other)
+
+    weights = np.ones(len(dataset))
+    weights[0] = weights[-1] = 0
+    list(build_loader(dataset, transform, batch_size=2, weights=weights))
+    assert mixed == set(dataset.names[1:-1])
 
 
 def test_length_of_an_epoch(dataset: DrivingDataset) -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +125,69 @@ def test_twice_changes_nothing_and_changes_are_seen(root: Path, tmp_path: Path) 
     drivable = packed[4].drivable
     assert drivable is not None
     assert not drivable.any()
+
+
+def describe(root: Path, text: str) -> None:
+    (root / "dataset.yaml").write_text(text)
+
+
+CHANGES: dict[str, Callable[[Path], object]] = {
+    "a label goes": lambda root: (root / "det_annotations/train/train_0001.json").unlink(),
+    "an older label comes": lambda root: (
+        cv2.imwrite(str(root / "ll_seg_annotations/train/train_0001.png"), np.full((72, 128), 255, np.uint8)),
+        os.utime(root / "ll_seg_annotations/train/train_0001.png", (10**9, 10**9)),
+    ),
+    "classes": lambda root: describe(root, "classes: {vehicle: [bus]}\nego_masks: {train_000: bonnet.png}\n"),
+    "thresholds": lambda root: describe(root, "drivable: {above: 254}\nego_masks: {train_000: bonnet.png}\n"),
+    "no ego mask": lambda root: describe(root, ""),
+    "another ego mask": lambda root: cv2.imwrite(str(root / "bonnet.png"), np.full((72, 128), 255, np.uint8)),
+    "attributes": lambda root: (root / "index.csv").write_text("name,split,source\ntrain_0001,train,city\n"),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_every_change_is_seen_and_prepared(root: Path, tmp_path: Path, change: str) -> None:
+    prepare(root, canvas=CANVAS)
+    CHANGES[change](root)
+    assert isinstance(open_dataset(root, "train", canvas=CANVAS), DrivingDataset)
+    prepare(root, canvas=CANVAS)
+    again = open_dataset(root, "train", canvas=CANVAS)
+    assert isinstance(again, PreparedDataset)
+    prepare(root, tmp_path / "fresh", canvas=CANVAS)
+    for name in ("train-000000.tar", "train-000000.index.jsonl"):
+        assert (root / ".prepared" / name).read_bytes() == (tmp_path / "fresh" / name).read_bytes()
+
+
+def test_splits_that_begin_alike_keep_their_shards(root: Path, tmp_path: Path) -> None:
+    write_published(root, "train-2024", 3)
+    for _ in range(2):
+        prepare(root, tmp_path / "out", canvas=CANVAS, shard_size=2)
+        for split, count in (("train", 11), ("train-2024", 3), ("val", 3)):
+            assert len(PreparedDataset(tmp_path / "out", split).names) == count
+
+
+def test_an_interrupted_change_of_the_shard_size_loses_nothing(root: Path) -> None:
+    prepare(root, canvas=CANVAS, shard_size=4)
+
+    def interrupt(done: int, _: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        prepare(root, canvas=CANVAS, shard_size=2, progress=interrupt)
+    assert isinstance(open_dataset(root, "train", canvas=CANVAS), DrivingDataset)
+    prepare(root, canvas=CANVAS, shard_size=2)
+    assert PreparedDataset(root / ".prepared", "train").names == DrivingDataset(root, "train").names
+
+
+def test_long_names(root: Path, tmp_path: Path) -> None:
+    name = "straße" * 20
+    (root / "images/val/val_0000.jpg").rename(root / f"images/val/{name}.jpg")
+    prepare(root, tmp_path / "out", canvas=CANVAS, splits=["val"])
+    raw, packed = DrivingDataset(root, "val"), PreparedDataset(tmp_path / "out", "val")
+    assert name in packed.names
+    for index, whole in enumerate(raw):
+        assert packed[index].name == whole.name
+        assert (packed[index].lane is None) == (whole.lane is None)
 
 
 def test_remote_shards_are_copied_when_used(root: Path, tmp_path: Path) -> None:

@@ -82,6 +82,11 @@ def test_index_gives_attributes(root: Path) -> None:
     dataset = DrivingDataset(root, "train")
     assert dataset.attributes(1) == {"timeofday": "night", "source": "city", "condition": "night"}
     assert dataset[1].attributes == dataset.attributes(1)
+    (root / "index.csv").write_text("name,split,source\ntrain_0001,train,straße\n", encoding="utf-8-sig")
+    assert DrivingDataset(root, "train").attributes(1)["source"] == "straße"
+    (root / "index.csv").write_bytes("name,split\nstraße,train\n".encode("latin-1"))
+    with pytest.raises(DataError, match=r"index\.csv: cannot be read as CSV in UTF-8"):
+        DrivingDataset(root, "train")
     (root / "index.csv").write_text("hello\n")
     with pytest.raises(DataError, match="'name' and 'split'"):
         DrivingDataset(root, "train")

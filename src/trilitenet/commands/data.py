@@ -287,7 +287,14 @@ def show(
     """
     if output.suffix.lower() not in {".jpg", ".jpeg", ".png", ".html"}:
         raise OutputError(f"{output}: must end in .jpg, .png or .html")
-    for option, value, least in (("count", count, 1), ("columns", columns, 1), ("width", width, 16), ("seed", seed, 0)):
+    numbers = (
+        ("count", count, 1),
+        ("columns", columns, 1),
+        ("width", width, 16),
+        ("seed", seed, 0),
+        ("start", start, 0),
+    )
+    for option, value, least in numbers:
         if value < least:
             raise ConfigError(f"{option} must be at least {least}, got {value}")
     wanted = dict(_pair(item) for item in where)
@@ -424,15 +431,17 @@ def _open_source(
 
 
 def _widths(items: Sequence[str]) -> dict[str, float]:
-    widths: dict[str, float] = {"train": 8.0, "*": 2.0}
+    widths: dict[str, float] = {}
     for item in items:
         split, _, text = item.rpartition("=")
         try:
             width = float(text)
         except ValueError as error:
             raise ConfigError(f"lane width must be a number or SPLIT=number, got {item!r}") from error
-        widths = {**widths, split: width} if split else {"*": width}
-    return widths
+        if not (math.isfinite(width) and width > 0):
+            raise ConfigError(f"lane width must be above 0 and finite, got {item!r}")
+        widths[split or "*"] = width
+    return widths if "*" in widths else {"train": 8.0, "*": 2.0, **widths}
 
 
 def _pair(item: str) -> tuple[str, str]:

@@ -116,11 +116,12 @@ def _centred(xyxy: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _strips(valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return (K, 4) xyxy px: the invalid area as upright strips, each as high as the area in it."""
+    """Return (K, 4) xyxy px: the invalid area as upright strips, each as high as a part of the area in it."""
     strips: list[tuple[float, float, float, float]] = []
     edges = np.linspace(0, valid.shape[1], _EGO_STRIPS + 1).round().astype(int)
     for left, right in itertools.pairwise(edges):
         rows = np.flatnonzero(~valid[:, left:right].all(axis=1))
-        if len(rows):
-            strips.append((left, rows[0], right, rows[-1] + 1))
+        for part in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
+            if len(part):
+                strips.append((left, part[0], right, part[-1] + 1))
     return np.array(strips, np.float32).reshape(-1, 4)

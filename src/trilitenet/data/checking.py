@@ -7,7 +7,6 @@ annotation is read. Of each image only a few hundred bytes are kept, so memory s
 from __future__ import annotations
 
 import concurrent.futures
-import csv
 import dataclasses
 import functools
 import hashlib
@@ -29,7 +28,15 @@ from PIL import Image
 from trilitenet.config import DEFAULT_ANCHORS, LONG_SIDE, Anchors
 from trilitenet.data.description import DatasetDescription, MaskMeaning, class_table, read_description
 from trilitenet.data.prepared import is_prepared
-from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, IMAGE_ENDINGS, IMAGE_FOLDER, LANE_FOLDER
+from trilitenet.data.reading import (
+    DETECTION_FOLDER,
+    DRIVABLE_FOLDER,
+    IMAGE_ENDINGS,
+    IMAGE_FOLDER,
+    LANE_FOLDER,
+    is_crowd,
+    read_index,
+)
 from trilitenet.errors import DataError, import_extra
 
 __all__ = ["KINDS", "CheckReport", "Finding", "check_dataset", "detect_layout"]
@@ -48,6 +55,7 @@ KINDS: Final[dict[str, str]] = {
     "orphan": "an annotation or a mask without its image",
     "unlabelled": "an image without any label",
     "name-in-two-splits": "the same name in two splits",
+    "name-twice": "images that differ in their ending alone, and would have the same labels",
     "duplicate": "the same file twice in one split",
     "leak-duplicate": "the same file in two splits",
     "leak-near-duplicate": "nearly the same picture in two splits",
@@ -248,7 +256,11 @@ def check_dataset(
         for fact in items:
             for kind, where in fact.faults:
                 collector.add(kind, split, where)
-    index = _read_index(root)
+    try:
+        index = read_index(root)
+    except DataError as error:
+        collector.add("index", "", str(error))
+        index = []
     _find_orphans(root, names, collector)
     _find_names(facts, collector)
     _find_duplicates(facts, collector)
@@ -387,14 +399,14 @@ def _look_at_boxes(
         content = json.loads(path.read_bytes())
         items = [item for frame in content["frames"] for item in (frame.get("objects") or ())]
         attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
-        labels = [(str(item["category"]), item.get("box2d"), item.get("attributes") or {}) for item in items]
+        labels = [(str(item["category"]), item.get("box2d"), is_crowd(item)) for item in items]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         faults.append(("annotation-unreadable", f"{where} ({_reason(error)})"))
         return {}, np.zeros((0, 2), np.float32), {}
     counts: Counter[str] = Counter()
     seen: set[tuple[str, float, float, float, float]] = set()
     sizes: list[tuple[float, float]] = []
-    for number, (category, box, own) in enumerate(labels):
+    for number, (category, box, crowd) in enumerate(labels):
         if box is None:
             continue
         place = f"{where} object {number} ({category})"
@@ -413,7 +425,7 @@ def _look_at_boxes(
         if (category, x1, y1, x2, y2) in seen:
             faults.append(("box-twice", place))
         seen.add((category, x1, y1, x2, y2))
-        ignored = bool(own.get("crowd", False)) or category in job.description.ignore
+        ignored = crowd or category in job.description.ignore
         counts["ignored" if ignored else category] += 1
         if size is not None and category in job.table and not ignored:
             scale = LONG_SIDE / max(size)
@@ -434,6 +446,9 @@ def _look_at_mask(
     found = (picture.height, picture.width)
     if size is not None and found != size:
         faults.append(("mask-size", f"{where} is {found[1]}x{found[0]}, its image {size[1]}x{size[0]}"))
+    if picture.mode.startswith("I"):
+        faults.append(("mask-values", f"{where} has 16 bits a pixel; save it with 8"))
+        return None
     counts = np.array(picture.convert("L").histogram())
     present = set(np.flatnonzero(counts).tolist())
     allowed = {0, *meaning.values, *meaning.ignore} if meaning.values else {*_PLAIN_VALUES, *meaning.ignore}
@@ -461,6 +476,10 @@ def _find_names(facts: dict[str, list[_Facts]], collector: _Collector) -> None:
     for one, two in itertools.combinations(facts, 2):
         for name in sorted({f.name for f in facts[one]} & {f.name for f in facts[two]}):
             collector.add("name-in-two-splits", f"{one}, {two}", name)
+    for split, items in facts.items():
+        for name, count in Counter(fact.name for fact in items).items():
+            if count > 1:
+                collector.add("name-twice", split, name)
 
 
 def _find_duplicates(facts: dict[str, list[_Facts]], collector: _Collector) -> None:
@@ -506,14 +525,6 @@ def _popcount(values: NDArray[np.uint64]) -> NDArray[np.uint8]:
         return np.asarray(np.bitwise_count(values), np.uint8)
     bits = np.unpackbits(values.view(np.uint8).reshape(-1, 8), axis=1)
     return np.asarray(bits.sum(axis=1), np.uint8)
-
-
-def _read_index(root: Path) -> list[dict[str, str]]:
-    path = root / "index.csv"
-    if not path.is_file():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
-        return [{key: value or "" for key, value in row.items() if key} for row in csv.DictReader(file)]
 
 
 def _find_sequences(index: list[dict[str, str]], facts: dict[str, list[_Facts]], collector: _Collector) -> None:

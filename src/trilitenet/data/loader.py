@@ -74,10 +74,13 @@ class _Draw:
 class _Samples(torch.utils.data.Dataset[Sample | TriLiteNetError]):
     """Transformed samples by `_Draw`."""
 
-    def __init__(self, dataset: SampleSource, transform: Transform, seed: int) -> None:
+    def __init__(
+        self, dataset: SampleSource, transform: Transform, seed: int, weights: NDArray[np.float64] | None
+    ) -> None:
         self._dataset = dataset
         self._transform = transform
         self._seed = seed
+        self._chance = None if weights is None else np.cumsum(weights) / weights.sum()
 
     def __getitem__(self, draw: _Draw) -> Sample | TriLiteNetError:
         """Return the sample, or why there is none: PyTorch would wrap what a worker raises into pages of text."""
@@ -88,7 +91,10 @@ class _Samples(torch.utils.data.Dataset[Sample | TriLiteNetError]):
             return error
 
     def _other(self, rng: np.random.Generator) -> Sample:
-        return self._dataset[int(rng.integers(len(self._dataset)))]
+        """Return a sample to mix another with, drawn by the weights too."""
+        if self._chance is None:
+            return self._dataset[int(rng.integers(len(self._dataset)))]
+        return self._dataset[int(np.searchsorted(self._chance, rng.random(), side="right"))]
 
 
 def _collate(samples: list[Sample | TriLiteNetError]) -> Batch | TriLiteNetError:
@@ -167,7 +173,7 @@ class Loader:
             cv2.setNumThreads(0)
         more: dict[str, Any] = {"persistent_workers": True, "prefetch_factor": 4} if workers else {}
         self._loader: torch.utils.data.DataLoader[Batch | TriLiteNetError] = torch.utils.data.DataLoader(
-            _Samples(dataset, transform, seed),  # type: ignore[arg-type]
+            _Samples(dataset, transform, seed, weights if shuffle else None),  # type: ignore[arg-type]
             batch_sampler=self._plan,
             collate_fn=_collate,
             num_workers=workers,

@@ -16,10 +16,12 @@ import concurrent.futures
 import contextlib
 import dataclasses
 import functools
+import hashlib
 import io
 import json
 import logging
 import multiprocessing
+import re
 import shutil
 import tarfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -156,6 +158,7 @@ def prepare(
     ]
     total = sum(map(len, datasets.values()))
     done = 0
+    _forget(plan, datasets)
     for count in _run_jobs(plan, jobs, workers):
         done += count
         if progress:
@@ -389,13 +392,14 @@ def _write_shard(plan: _Plan, split: str, number: int, names: list[str]) -> int:
     path = plan.out / f"{split}-{number:06}.tar"
     index = plan.out / _index_name(path.name)
     dataset = DrivingDataset(plan.root, split, class_names=plan.class_names, names=names)
+    made_from = _made_from(dataset)
     if path.is_file() and index.is_file():
-        there = [json.loads(line)["name"] for line in index.read_bytes().splitlines()]
-        if there == names and index.stat().st_mtime >= _newest(dataset):
+        there = [json.loads(line) for line in index.read_bytes().splitlines()]
+        if [entry["name"] for entry in there] == names and there[0].get("made_from") == made_from:
             return len(names)
     entries: list[dict[str, Any]] = []
     with replacing(index) as index_part, replacing(path) as part:
-        with tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as tar:
+        with tarfile.open(part, "w", format=tarfile.PAX_FORMAT) as tar:  # names of any length
             for sample in dataset:
                 members, entry = _encode(shrink(sample, plan.canvas, plan.mask_above), plan)
                 for ending, data in members.items():
@@ -404,6 +408,7 @@ def _write_shard(plan: _Plan, split: str, number: int, names: list[str]) -> int:
                     tar.addfile(member, io.BytesIO(data))
                 entries.append(entry)
         _locate(part, entries)
+        entries[0]["made_from"] = made_from
         index_part.write_text("".join(json.dumps(entry) + "\n" for entry in entries), encoding="utf-8")
     return len(names)
 
@@ -506,12 +511,22 @@ def _open_out(plan: _Plan) -> None:
         state.write_text(json.dumps({**_settings(plan), "splits": {}, "shards": {}}), encoding="utf-8")
 
 
+def _forget(plan: _Plan, splits: Iterable[str]) -> None:
+    """Take splits whose shards may be written again out of the state, so that nobody reads a mixture."""
+    there = _read_state(plan.out)
+    for split in splits:
+        there["splits"].pop(split, None)
+        there["shards"].pop(split, None)
+    _replace_state(plan, there["splits"], there["shards"])
+
+
 def _write_state(plan: _Plan, datasets: Mapping[str, SampleSource]) -> None:
     there = _read_state(plan.out)
     splits, shards = dict(there["splits"]), dict(there["shards"])
     for split, dataset in datasets.items():
         splits[split] = _fingerprint(plan.root, split)
-        found = sorted(path.name for path in plan.out.glob(f"{split}-[0-9]*.tar"))
+        shard_name = re.compile(re.escape(split) + r"-\d{6,}\.tar")
+        found = sorted(path.name for path in plan.out.iterdir() if shard_name.fullmatch(path.name))
         kept, count = [], 0
         for name in found:
             if count < len(dataset):
@@ -521,6 +536,10 @@ def _write_state(plan: _Plan, datasets: Mapping[str, SampleSource]) -> None:
                 (plan.out / name).unlink()
                 (plan.out / _index_name(name)).unlink(missing_ok=True)
         shards[split] = kept
+    _replace_state(plan, splits, shards)
+
+
+def _replace_state(plan: _Plan, splits: Mapping[str, Any], shards: Mapping[str, Any]) -> None:
     text = json.dumps({**_settings(plan), "splits": splits, "shards": shards}, indent=1, sort_keys=True)
     with replacing(plan.out / PREPARED_FILE) as part:
         part.write_text(text, encoding="utf-8")
@@ -541,7 +560,14 @@ def _files_of(root: Path, split: str) -> Iterator[Path]:
     for folder in (IMAGE_FOLDER, DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER):
         if (root / folder / split).is_dir():
             yield from (root / folder / split).iterdir()
-    for name in ("dataset.yaml", "index.csv"):
+    yield from _common_files(root)
+
+
+def _common_files(root: Path) -> Iterator[Path]:
+    """Return the files that say something of every image."""
+    description = read_description(root)
+    own_car = (description.ego_mask, *description.ego_masks.values())
+    for name in ("dataset.yaml", "index.csv", *filter(None, own_car)):
         if (root / name).is_file():
             yield root / name
 
@@ -552,13 +578,15 @@ def _fingerprint(root: Path, split: str) -> list[int]:
     return [len(stats), sum(stat.st_size for stat in stats), max((stat.st_mtime_ns for stat in stats), default=0)]
 
 
-def _newest(dataset: DrivingDataset) -> float:
-    """Return when the newest of a data set's files was written, in seconds."""
-    newest = 0.0
+def _made_from(dataset: DrivingDataset) -> str:
+    """Return the SHA-256 of which files samples are made from, how large they are and when they were written."""
+    digest = hashlib.sha256()
+    paths = [*_common_files(dataset.root)]
     for index, name in enumerate(dataset.names):
-        paths = [dataset.image_path(index), dataset.root / DETECTION_FOLDER / dataset.split / f"{name}.json"]
+        paths += [dataset.image_path(index), dataset.root / DETECTION_FOLDER / dataset.split / f"{name}.json"]
         paths += [dataset.root / folder / dataset.split / f"{name}.png" for folder in (DRIVABLE_FOLDER, LANE_FOLDER)]
-        for path in paths:
-            with contextlib.suppress(FileNotFoundError):
-                newest = max(newest, path.stat().st_mtime)
-    return newest
+    for path in paths:
+        with contextlib.suppress(FileNotFoundError):
+            stat = path.stat()
+            digest.update(f"{path.relative_to(dataset.root)}\n{stat.st_size} {stat.st_mtime_ns}\n".encode())
+    return digest.hexdigest()

@@ -40,7 +40,9 @@ __all__ = [
     "SampleSource",
     "decode_image",
     "decode_mask",
+    "is_crowd",
     "parse_annotation",
+    "read_index",
     "sampling_weights",
 ]
 
@@ -137,7 +139,7 @@ def parse_annotation(
                 box = item.get("box2d")
                 if box is None:
                     continue
-                crowd = bool((item.get("attributes") or {}).get("crowd", False)) and category in table
+                crowd = is_crowd(item) and category in table
                 if not crowd and category not in table and category not in ignore:
                     continue
                 x1, y1 = max(float(box["x1"]), 0.0), max(float(box["y1"]), 0.0)
@@ -158,6 +160,11 @@ def parse_annotation(
         np.array(ignored, np.float32).reshape(-1, 4),
         attributes,
     )
+
+
+def is_crowd(item: Mapping[str, Any]) -> bool:
+    """Return whether an object of an annotation is marked as a crowd; tools that know text alone write ``"false"``."""
+    return str((item.get("attributes") or {}).get("crowd", False)).strip().lower() not in {"", "0", "false", "none"}
 
 
 class DrivingDataset:
@@ -383,7 +390,15 @@ def _image_files(root: Path, split: str) -> dict[str, str]:
     folder = root / IMAGE_FOLDER / split
     if not folder.is_dir():
         raise DataError(f"{root}: no folder {IMAGE_FOLDER}/{split}; expected the published layout, see docs/data.md")
-    files = {path.stem: path.name for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS}
+    files: dict[str, str] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() not in IMAGE_ENDINGS:
+            continue
+        if path.stem in files:
+            raise DataError(
+                f"{folder}: {files[path.stem]} and {path.name} would have the same labels; remove or rename one"
+            )
+        files[path.stem] = path.name
     if not files:
         raise DataError(f"{folder}: no images ({', '.join(IMAGE_ENDINGS)})")
     return files
@@ -391,16 +406,32 @@ def _image_files(root: Path, split: str) -> dict[str, str]:
 
 def _index_attributes(root: Path, split: str) -> dict[str, dict[str, str]]:
     """Return image name -> the further columns of ``index.csv``, if there is one."""
+    return {
+        row["name"]: {column: row[column] or "" for column in sorted(row) if column not in {"name", "split"}}
+        for row in read_index(root)
+        if row["split"] == split
+    }
+
+
+def read_index(root: Path) -> list[dict[str, Any]]:
+    """Return the rows of ``index.csv``; none if there is no such file.
+
+    Raises:
+        DataError: If it has no columns ``name`` and ``split``, or is not UTF-8.
+    """
     path = root / "index.csv"
     if not path.is_file():
-        return {}
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        columns = set(reader.fieldnames or ())
-        if not {"name", "split"} <= columns:
-            raise DataError(f"{path}: needs the columns 'name' and 'split'")
-        extra = sorted(columns - {"name", "split"})
-        return {row["name"]: {column: row[column] or "" for column in extra} for row in reader if row["split"] == split}
+        return []
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets put a mark before the first column
+            reader = csv.DictReader(file, restkey="", restval="")
+            columns = set(reader.fieldnames or ())
+            rows = list(reader)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise DataError(f"{path}: cannot be read as CSV in UTF-8 ({brief(error)})") from error
+    if not {"name", "split"} <= columns:
+        raise DataError(f"{path}: needs the columns 'name' and 'split'")
+    return [{column: row[column] for column in columns} for row in rows]
 
 
 @functools.lru_cache(maxsize=64)

@@ -52,7 +52,8 @@ def write_dataset(
         progress: Called with the number of scenes done after each.
 
     Raises:
-        ConfigError: If ``count`` or ``workers`` is under 1, the seed negative, or the size too small.
+        ConfigError: If ``count`` or ``workers`` is under 1, the seed negative, the size too small, or ``split`` no name
+            of one folder.
         OutputError: If the split exists already, or a file cannot be written.
     """
     if count < 1 or workers < 1:
@@ -61,6 +62,8 @@ def write_dataset(
         raise ConfigError(f"seed must not be negative, got {seed}")
     SyntheticScenes(seed, size, count, labels=labels)  # refuses a wrong size before there is a folder
     root = Path(root)
+    if Path(split).name != split or split in {"", ".", ".."}:
+        raise ConfigError(f"split must be the name of one folder, got {split!r}")
     if any((root / FOLDERS[0] / split).glob("*")):
         raise OutputError(f"{root / FOLDERS[0] / split} is not empty; choose another folder or split, or remove it")
     try:

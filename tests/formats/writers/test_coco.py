@@ -1,9 +1,11 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -79,6 +81,16 @@ def test_frames_of_a_video_are_named_and_tracked(tmp_path: Path, video: list[Per
     tracks = [annotation.get("track_id") for annotation in document["annotations"] if annotation["category_id"] <= 2]
     assert tracks == [7, None, 7, None, None, 7, None]
     assert len({annotation["id"] for annotation in document["annotations"]}) == len(document["annotations"])
+
+
+@pytest.mark.parametrize("kept", ["boxes", "drivable", "lane"])
+def test_what_was_not_looked_for_has_no_category(tmp_path: Path, pictures: list[Perception], kept: str) -> None:
+    others: dict[str, Any] = {field: None for field in ("boxes", "drivable", "lane") if field != kept}
+    document = json.loads(write(tmp_path, [dataclasses.replace(pictures[0], **others)]).read_text(encoding="utf-8"))
+    names = [category["name"] for category in document["categories"]]
+    assert names == (["vehicle", "rider & bike"] if kept == "boxes" else [kept])
+    used = {annotation["category_id"] for annotation in document["annotations"]}
+    assert used == {category["id"] for category in document["categories"]}
 
 
 def test_no_image_is_still_a_file(tmp_path: Path) -> None:

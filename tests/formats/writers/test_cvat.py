@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import dataclasses
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -44,6 +46,18 @@ def test_pictures(tmp_path: Path, pictures: list[Perception]) -> None:
     for node, mask in zip(images[0].findall("mask"), (pictures[0].drivable, pictures[0].lane), strict=True):
         np.testing.assert_array_equal(decode(node, pictures[0].size), mask)
     assert len(images[1]) == 0
+
+
+@pytest.mark.parametrize(
+    ("kept", "labels"),
+    [("boxes", {"vehicle", "rider & bike"}), ("drivable", {"drivable"}), ("lane", {"lane", "lane line"})],
+)
+def test_what_was_not_looked_for_has_no_label(
+    tmp_path: Path, pictures: list[Perception], kept: str, labels: set[str]
+) -> None:
+    others: dict[str, Any] = {field: None for field in ("boxes", "drivable", "lane") if field != kept}
+    root = write(tmp_path, [dataclasses.replace(pictures[0], **others)])
+    assert {name.text for name in root.findall("meta/task/labels/label/name")} == labels
 
 
 def test_video_ends_tracks_where_they_end(tmp_path: Path, video: list[Perception]) -> None:

@@ -20,7 +20,8 @@ class CocoWriter(Writer):
     """Writes ``coco.json``.
 
     The classes have the category ids 1, 2, ...; after them come ``drivable`` and ``lane``, whose annotations are one
-    run-length mask an image. The list of images is held until the end: about 200 bytes a frame.
+    run-length mask an image. A task that no perception has, has no categories: it was not looked for. The list of
+    images is held until the end: about 200 bytes a frame.
 
     Args:
         output: The folder.
@@ -35,6 +36,7 @@ class CocoWriter(Writer):
         self._stream: JsonStream | None = JsonStream(self.create("coco.json"), head)
         self._images: list[dict[str, Any]] = []
         self._class_names: tuple[str, ...] = ()
+        self._tasks: set[str] = set()
         self._annotations = 0
 
     def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
@@ -45,6 +47,8 @@ class CocoWriter(Writer):
         image = {"id": image_id, "file_name": self.image_name(perception), "width": width, "height": height}
         self._images.append(image)
         boxes = perception.boxes
+        masks = {"drivable": perception.drivable, "lane": perception.lane}
+        self._tasks |= {task for task, result in {"detection": boxes, **masks}.items() if result is not None}
         for index in range(0 if boxes is None else len(boxes)):
             assert boxes is not None
             left, top, right, bottom = rounded(boxes.xyxy[index])
@@ -59,7 +63,7 @@ class CocoWriter(Writer):
             if boxes.track_id is not None and boxes.track_id[index] >= 0:
                 annotation["track_id"] = int(boxes.track_id[index])
             self._add(image_id, annotation)
-        for place, mask in enumerate((perception.drivable, perception.lane), start=1):
+        for place, mask in enumerate(masks.values(), start=1):
             if mask is None or not mask.any():
                 continue
             rows, columns = mask.any(axis=1).nonzero()[0], mask.any(axis=0).nonzero()[0]
@@ -78,12 +82,13 @@ class CocoWriter(Writer):
         """Write the images and categories, and finish the file."""
         if self._stream is None:
             return
-        categories = [
-            *({"name": name, "supercategory": "object", "isthing": 1} for name in self._class_names),
-            {"name": "drivable", "supercategory": "road", "isthing": 0},
-            {"name": "lane", "supercategory": "road", "isthing": 0},
+        categories = [("detection", name, "object", 1) for name in self._class_names]
+        categories += [(task, task, "road", 0) for task in ("drivable", "lane")]
+        numbered = [
+            {"id": number, "name": name, "supercategory": above, "isthing": thing}
+            for number, (task, name, above, thing) in enumerate(categories, start=1)
+            if task in self._tasks
         ]
-        numbered = [{"id": number, **category} for number, category in enumerate(categories, start=1)]
         images = ",\n".join(dumps(image) for image in self._images)
         self._stream.close(f'],\n"images": [\n{images}\n],\n"categories": {dumps(numbered)}}}')
         self.finish(self._stream.path)

@@ -99,8 +99,10 @@ def cvat_mask(mask: NDArray[np.bool_]) -> tuple[str, int, int, int, int] | None:
 
 
 def _labels(perception: Perception) -> str:
-    """Return the labels a task needs, as CVAT's ``meta`` lists them."""
-    names = [*perception.class_names, "drivable", "lane", _LINE]
+    """Return the labels that results like this one need, as CVAT's ``meta`` lists them."""
+    names = [] if perception.boxes is None else [*perception.class_names]
+    names += [] if perception.drivable is None else ["drivable"]
+    names += [] if perception.lane is None else ["lane", _LINE]
     label = (
         "        <label><name>{}</name><type>any</type><attributes><attribute><name>confidence</name>"
         "<mutable>True</mutable><input_type>text</input_type><default_value></default_value><values></values>"
