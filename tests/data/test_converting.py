@@ -3,15 +3,18 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.formats.readers import raw_bdd
 from trilitenet.data.converting import ConversionOptions, convert
+from trilitenet.data.description import read_description
 from trilitenet.data.reading import DrivingDataset
-from trilitenet.data.records import ImageRecord
+from trilitenet.data.records import AreaLabel, CocoRuns, ImageRecord, LaneLabel, MaskFile, ObjectLabel, RowRuns
 from trilitenet.errors import ConfigError, DataError, OutputError
 from trilitenet.formats.readers.bdd100k import BddSource, read_bdd100k
 
@@ -46,6 +49,7 @@ class Interrupted:
         self._source = source
         self._left = after
         self.splits = source.splits
+        self.origin = source.origin
 
     def names(self, split: str) -> list[str]:
         return self._source.names(split)
@@ -127,8 +131,9 @@ def test_widths_differ_by_split(tmp_path: Path) -> None:
 
 
 def test_options_are_checked_and_kept(raw: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="above 0"):
-        ConversionOptions(lane_width={"*": 0})
+    for width in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ConfigError, match="above 0 and finite"):
+            ConversionOptions(lane_width={"*": width})
     with pytest.raises(DataError, match="both"):
         ConversionOptions(classes={"small": ("car",), "large": ("car",)})
     convert(read_bdd100k(raw), tmp_path / "out")
@@ -171,3 +176,170 @@ def test_a_broken_image_is_left_out_and_counted(raw: Path, tmp_path: Path) -> No
     assert report.images["train"] == 21
     assert report.dropped["train"]["image: labels or image broken"] == 1
     assert "c03" not in DrivingDataset(tmp_path / "out", "train").names
+
+
+class Records:
+    """Records that a test makes, as a source."""
+
+    origin: ClassVar[dict[str, str]] = {"kind": "test"}
+
+    def __init__(self, **splits: list[ImageRecord]) -> None:
+        self._splits = {split: {record.name: record for record in items} for split, items in splits.items()}
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        return tuple(self._splits)
+
+    def names(self, split: str) -> list[str]:
+        return sorted(self._splits[split])
+
+    def record(self, split: str, name: str) -> ImageRecord:
+        return self._splits[split][name]
+
+
+def picture(path: Path, shape: tuple[int, int] = (6, 8), **more: Any) -> ImageRecord:
+    """Write an image and return its record."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as file:
+        Image.new("RGB", shape[::-1]).save(file, "PNG")
+    return ImageRecord(path.stem, path, **more)
+
+
+CAR = ObjectLabel("car", (1.0, 1.0, 4.0, 4.0))
+BOX = AreaLabel("direct", np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0]]))
+
+
+def test_again_ends_as_a_fresh_conversion(tmp_path: Path) -> None:
+    """Changed labels, changed and removed images and splits: nothing of the first run stays."""
+    kept, gone = picture(tmp_path / "raw/a.png", objects=(CAR,)), picture(tmp_path / "raw/b.png", objects=(CAR,))
+    relabelled = picture(tmp_path / "raw/c.png", objects=(CAR,), drivable=(BOX,))
+    replaced = picture(tmp_path / "raw/d.png", objects=(CAR,))
+    convert(Records(train=[kept, gone, relabelled, replaced], val=[kept]), tmp_path / "out")
+    before = (tmp_path / "out/det_annotations/train/a.json").stat().st_mtime_ns
+    (tmp_path / "out/images/train/mine.png").write_bytes(b"a user's own")
+    replaced.image.unlink()
+    moved = picture(tmp_path / "raw/d.jpg", (12, 8), objects=(CAR, dataclasses.replace(CAR, category="bus")))
+    second = Records(train=[kept, dataclasses.replace(relabelled, objects=(), drivable=None), moved])
+    again = convert(second, tmp_path / "out")
+    fresh = convert(second, tmp_path / "fresh")
+    assert (tmp_path / "out/images/train/mine.png").is_file()
+    (tmp_path / "out/images/train/mine.png").unlink()
+    one, two = tree(tmp_path / "out", times=False), tree(tmp_path / "fresh", times=False)
+    two["dataset.yaml"] = (two["dataset.yaml"][0].replace(b"name: fresh", b"name: out"), 0)
+    assert one == two
+    assert again == fresh
+    assert not (tmp_path / "out/images/val").exists()
+    assert (tmp_path / "out/det_annotations/train/a.json").stat().st_mtime_ns == before
+
+
+def test_an_image_or_mask_that_changed_is_made_again(tmp_path: Path) -> None:
+    picture(tmp_path / "mask.png")
+    record = picture(tmp_path / "raw/a.png", lane=MaskFile(tmp_path / "mask.png", {}))
+    source = Records(train=[record])
+    convert(source, tmp_path / "out", ConversionOptions(images="copy"))
+    cv2.imwrite(str(tmp_path / "mask.png"), np.ones((6, 8), np.uint8))
+    cv2.imwrite(str(record.image), np.full((6, 8, 3), 9, np.uint8))
+    convert(source, tmp_path / "out", ConversionOptions(images="copy"))
+    sample = DrivingDataset(tmp_path / "out", "train")[0]
+    assert sample.lane is not None
+    assert sample.lane.all()
+    assert (sample.image == 9).all()
+
+
+def test_another_source_is_refused(tmp_path: Path) -> None:
+    source = Records(train=[picture(tmp_path / "raw/a.png")])
+    convert(source, tmp_path / "out")
+    source.origin = {"kind": "another"}  # type: ignore[misc]
+    with pytest.raises(OutputError, match="another source"):
+        convert(source, tmp_path / "out")
+    options = tmp_path / "out/.conversion/options.json"
+    options.write_text(json.dumps({k: v for k, v in json.loads(options.read_text()).items() if k != "source"}))
+    with pytest.raises(OutputError, match="does not say of what source"):
+        convert(source, tmp_path / "out")
+
+
+def test_splits_one_by_one_are_reported_together(tmp_path: Path) -> None:
+    record = picture(tmp_path / "raw/a.png", objects=(CAR,))
+    source = Records(train=[record], val=[record], test=[])
+    convert(source, tmp_path / "out", splits=["train"])
+    with (tmp_path / "out/.conversion/train.jsonl").open("a") as file:
+        file.write('{"name": "cut off')
+    report = convert(source, tmp_path / "out", splits=["val"])
+    assert report.images == {"train": 1, "val": 1}
+    assert json.loads((tmp_path / "out/conversion.json").read_text()) == report.to_dict()
+
+
+def test_splits_without_images_are_left_out(tmp_path: Path) -> None:
+    broken = ImageRecord("b", tmp_path / "raw/nowhere.png")
+    report = convert(Records(train=[picture(tmp_path / "raw/a.png")], val=[], test=[broken]), tmp_path / "out")
+    assert read_description(tmp_path / "out").splits == ("train",)
+    assert [path.name for path in (tmp_path / "out/images").iterdir()] == ["train"]
+    assert report.dropped["test"] == {"image: labels or image broken": 1}
+
+
+def test_attributes_leave_the_columns_of_the_index_alone(tmp_path: Path) -> None:
+    record = picture(tmp_path / "raw/a.png", attributes={"name": "Ann", "split": "left", "weather": "rainy"})
+    convert(Records(train=[record]), tmp_path / "out")
+    expected = {"attribute_name": "Ann", "attribute_split": "left", "weather": "rainy"}
+    assert DrivingDataset(tmp_path / "out", "train")[0].attributes == expected
+
+
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "message"),
+    [
+        ("a.tif", {}, "training reads .jpg"),
+        ("a\udce9.png", {}, "not UTF-8"),
+        ("a.png", {"attributes": {"by": "\ud800"}}, "not UTF-8"),
+        ("a.png", {"size": (12, 16)}, "is 8x6, its labels are for 16x12"),
+        ("a.png", {"drivable": (AreaLabel("direct", np.array([[0, 0], [4, NAN], [4, 4]])),)}, "not a number"),
+        ("a.png", {"lane": (LaneLabel("lane", np.array([[0, 0], [np.inf, 1]])),)}, "not a number"),
+        ("a.png", {"lane": (LaneLabel("lane", np.array([[0, 0], [NAN, 1]]), edge=True),) * 2}, "not a number"),
+        ("a.png", {"drivable": (RowRuns("direct", 0, 0, 4, 2, (4, -1, 5)),)}, "negative"),
+        ("a.png", {"drivable": (CocoRuns("direct", (6, 8), "zz!!zz"),)}, "run-length"),
+    ],
+)
+def test_what_cannot_be_used_is_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str, more: dict[str, Any], message: str
+) -> None:
+    bad = picture(tmp_path / "bad" / name, **more)
+    good = picture(tmp_path / "raw/good.png", objects=(CAR,))
+    report = convert(Records(train=[good, bad]), tmp_path / "out")
+    assert report.images == {"train": 1}
+    assert report.dropped["train"] == {"image: labels or image broken": 1}
+    assert message in caplog.text
+    assert DrivingDataset(tmp_path / "out", "train").names == ["good"]
+
+
+def test_a_size_is_compared_with_the_turned_image(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (8, 6)).save(path, exif=exif)
+    records = [ImageRecord("a", path, size=(8, 6)), ImageRecord("b", path, size=(6, 8))]
+    assert convert(Records(train=records), tmp_path / "out").images == {"train": 1}
+
+
+@pytest.mark.parametrize(
+    ("mode", "values"),
+    [
+        ("I;16", {}), ("L", {}), ("RGB", {}), ("1", {}), ("I;16", {65535: "foreground"}), ("1", {255: "foreground"}),
+        ("1", {1: "foreground"}), ("L", {1: "foreground"}),
+    ],
+)  # fmt: skip
+def test_mask_pictures_of_every_depth(tmp_path: Path, mode: str, values: dict[int | tuple[int, int, int], str]) -> None:
+    truth = np.zeros((6, 8), np.bool_)
+    truth[2:4, 3:] = True
+    masks = {
+        "I;16": Image.fromarray(truth.astype(np.uint16) * 65535),
+        "L": Image.fromarray(truth.astype(np.uint8)),
+        "RGB": Image.fromarray(truth[..., None] * np.array([0, 0, 1], np.uint8)),
+        "1": Image.fromarray(truth),
+    }
+    assert masks[mode].mode == mode
+    masks[mode].save(tmp_path / "mask.png")
+    record = picture(tmp_path / "raw/a.png", lane=MaskFile(tmp_path / "mask.png", values))
+    convert(Records(train=[record]), tmp_path / "out")
+    np.testing.assert_array_equal(DrivingDataset(tmp_path / "out", "train")[0].lane, truth)

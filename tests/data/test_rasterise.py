@@ -117,5 +117,11 @@ def test_bad_shapes_are_refused() -> None:
         flatten([[0, 0], [1, 1]], "L", closed=False)
     with pytest.raises(DataError, match="one letter"):
         flatten([[0, 0], [1, 1]], "LX", closed=False)
-    with pytest.raises(DataError, match="not a number"):
-        flatten([[0, 0], [float("nan"), 1]], "LL", closed=False)
+    for wrong in (float("nan"), float("inf")):
+        points = np.array([[0, 0], [wrong, 1], [3, 3]])
+        with pytest.raises(DataError, match="not a number"):
+            flatten(points.tolist(), "LLL", closed=False)
+        with pytest.raises(DataError, match="not a number"):
+            fill_polygon(np.zeros((8, 8), np.uint8), points)
+        with pytest.raises(DataError, match="not a number"):
+            draw_line(np.zeros((8, 8), np.uint8), points, 2.0)

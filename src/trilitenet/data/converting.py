@@ -8,23 +8,26 @@ from __future__ import annotations
 
 import collections
 import concurrent.futures
+import contextlib
 import csv
 import dataclasses
+import hashlib
 import io
 import json
 import logging
+import math
 import multiprocessing
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from trilitenet.data.description import (
     DESCRIPTION_FILE,
@@ -36,9 +39,18 @@ from trilitenet.data.description import (
     write_description,
 )
 from trilitenet.data.lane_edges import centre_line, pair_edges
-from trilitenet.data.rasterise import draw_line, fill_polygon
-from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, IMAGE_FOLDER, LANE_FOLDER
-from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel, RecordSource, RunLabel
+from trilitenet.data.rasterise import check_finite, draw_line, fill_polygon
+from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, IMAGE_ENDINGS, IMAGE_FOLDER, LANE_FOLDER
+from trilitenet.data.records import (
+    AreaLabel,
+    ImageRecord,
+    LaneLabel,
+    MaskFile,
+    ObjectLabel,
+    RecordSource,
+    RunLabel,
+    image_size,
+)
 from trilitenet.errors import ConfigError, DataError, OutputError, replacing, writing
 
 __all__ = ["ConversionOptions", "ConversionReport", "convert", "drivable_mask", "lane_mask"]
@@ -55,6 +67,13 @@ IGNORE_VALUE: Final = 64
 """Mask value of pixels that are neither foreground nor background."""
 
 _STATE_FOLDER: Final = ".conversion"
+
+_TASK_FILES: Final = {
+    "detection": (DETECTION_FOLDER, ".json"),
+    "drivable": (DRIVABLE_FOLDER, ".png"),
+    "lane": (LANE_FOLDER, ".png"),
+}
+"""Folder and ending of each task's labels."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,8 +105,8 @@ class ConversionOptions:
     images: Literal["link", "copy", "symlink"] = "link"
 
     def __post_init__(self) -> None:
-        if any(width <= 0 for width in self.lane_width.values()):
-            raise ConfigError(f"lane widths must be above 0, got {self.lane_width}")
+        if not all(math.isfinite(width) and width > 0 for width in self.lane_width.values()):
+            raise ConfigError(f"lane widths must be above 0 and finite, got {self.lane_width}")
         class_table(tuple(self.classes), self.classes)
 
     def width(self, split: str) -> float:
@@ -97,7 +116,7 @@ class ConversionOptions:
 
 @dataclasses.dataclass(frozen=True)
 class ConversionReport:
-    """What a conversion did.
+    """What a conversion did, and earlier ones of other splits into the same folder.
 
     Attributes:
         images: Split -> images written.
@@ -130,8 +149,9 @@ def convert(
 ) -> ConversionReport:
     """Write a foreign data set in the published layout.
 
-    What is there already from an earlier run with the same options is kept; an image whose labels are broken is left
-    out, counted and logged.
+    What is there already from an earlier run of the same source with the same options is kept where its labels and
+    files are unchanged; what the source no longer has is removed. An image whose labels are broken is left out, counted
+    and logged.
 
     Args:
         source: The foreign data set.
@@ -143,7 +163,7 @@ def convert(
         progress: Called with (images done, images in all).
 
     Raises:
-        OutputError: If ``out`` holds something else, or a conversion with other options.
+        OutputError: If ``out`` holds something else, or a conversion with other options or of another source.
         DataError: If a split is unknown.
     """
     options = options or ConversionOptions()
@@ -152,32 +172,55 @@ def convert(
     unknown = [split for split in chosen if split not in source.splits]
     if unknown:
         raise DataError(f"no split {unknown[0]!r}; there are {', '.join(source.splits)}")
-    state = _open_state(root, options)
+    state = _open_state(root, options, source.origin)
     names = {split: source.names(split) for split in chosen}
+    if splits is None:
+        names |= {split: [] for split in _read_journals(state, ()) if split not in names}
     total = sum(map(len, names.values()))
     finished = 0
-    summaries: dict[str, dict[str, dict[str, Any]]] = {}
-    for split in chosen:
-        for folder in (IMAGE_FOLDER, DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER):
-            (root / folder / split).mkdir(parents=True, exist_ok=True)
-        done = _read_journal(root, state, split, set(names[split]))
-        finished += len(done)
-        if progress:
-            progress(finished, total)
-        todo = [name for name in names[split] if name not in done]
-        with _journal_path(state, split).open("a", encoding="utf-8") as journal:
-            for summary in _run(source, split, todo, root, options, workers):
-                done[summary["name"]] = summary
-                journal.write(json.dumps(summary, sort_keys=True) + "\n")
-                journal.flush()
-                finished += 1
-                if progress:
-                    progress(finished, total)
-        _rewrite(_journal_path(state, split), "".join(json.dumps(done[n], sort_keys=True) + "\n" for n in sorted(done)))
-        summaries[split] = done
-    report = _report(summaries)
-    _finish(root, options, description, report)
+    if progress:
+        progress(finished, total)
+    for split, wanted in names.items():
+        for _ in _convert_split(source, split, wanted, root, options, workers):
+            finished += 1
+            if progress:
+                progress(finished, total)
+    journals = _read_journals(state, source.splits)
+    report = _report(journals)
+    _finish(root, options, description, report, journals)
     return report
+
+
+def _convert_split(
+    source: RecordSource, split: str, names: list[str], root: Path, options: ConversionOptions, workers: int
+) -> Iterator[str]:
+    """Convert a split's images and yield their names one by one; at the end its files are those of a first run."""
+    folders = [root / folder / split for folder in (IMAGE_FOLDER, *(folder for folder, _ in _TASK_FILES.values()))]
+    path = _journal_path(root / _STATE_FOLDER, split)
+    earlier = _read_journal(path)
+    for name in earlier.keys() - set(names):
+        _remove_files(root, split, name)
+        del earlier[name]
+    done: dict[str, dict[str, Any]] = {}
+    if names:
+        for folder in folders:
+            folder.mkdir(parents=True, exist_ok=True)
+        _rewrite(path, _journal_text(earlier))
+        with path.open("a", encoding="utf-8") as journal:
+            for summary in _run(source, split, [(name, earlier.get(name)) for name in names], root, options, workers):
+                name = summary["name"]
+                done[name] = summary
+                if summary != earlier.get(name):
+                    journal.write(json.dumps(summary, sort_keys=True) + "\n")
+                    journal.flush()
+                yield name
+        _rewrite(path, _journal_text(done))
+    else:
+        path.unlink(missing_ok=True)
+    if not any("image" in summary for summary in done.values()):
+        for folder in folders:
+            with contextlib.suppress(OSError):  # missing, or holds files that are not of a conversion
+                folder.rmdir()
 
 
 def drivable_mask(
@@ -244,6 +287,7 @@ def lane_mask(
             fill_polygon(mask, lane.points, 255)
             drawn["outlines"] += 1
         elif lane.edge and options.pair_edges:
+            check_finite(lane.points)
             groups[lane.category, lane.style, lane.direction].append(lane.points)
         else:
             draw_line(mask, lane.points, width * factor, 255)
@@ -266,12 +310,20 @@ class _Job:
     root: Path
     options: ConversionOptions
 
-    def __call__(self, name: str) -> dict[str, Any]:
+    def __call__(self, item: tuple[str, dict[str, Any] | None]) -> dict[str, Any]:
+        """Convert the image of a name, unless the line that an earlier run wrote of it still holds."""
+        name, earlier = item
         try:
-            return _convert_one(self.source.record(self.split, name), self.split, self.root, self.options)
+            record = self.source.record(self.split, name)
+            digest = _digest(record)
+            if earlier and earlier.get("digest") == digest and _is_complete(self.root, self.split, earlier):
+                return earlier
+            summary = {**_convert_one(record, self.split, self.root, self.options), "digest": digest}
         except DataError as error:
-            _logger.warning("%s", error)
-            return {"name": name, "dropped": {"image: labels or image broken": 1}, "error": str(error)}
+            _logger.warning("left out %s/%s: %s", self.split, name, error)
+            summary = {"name": name, "dropped": {"image: labels or image broken": 1}, "error": str(error)}
+        _remove_files(self.root, self.split, name, keep=_files(self.split, summary))
+        return summary
 
 
 _job: _Job | None = None
@@ -283,29 +335,44 @@ def _start(job: _Job) -> None:
     cv2.setNumThreads(1)
 
 
-def _work(name: str) -> dict[str, Any]:
+def _work(item: tuple[str, dict[str, Any] | None]) -> dict[str, Any]:
     if _job is None:
         raise RuntimeError("the worker was not started")
-    return _job(name)
+    return _job(item)
 
 
 def _run(
-    source: RecordSource, split: str, names: list[str], root: Path, options: ConversionOptions, workers: int
+    source: RecordSource,
+    split: str,
+    items: list[tuple[str, dict[str, Any] | None]],
+    root: Path,
+    options: ConversionOptions,
+    workers: int,
 ) -> Iterator[dict[str, Any]]:
+    """Yield the line of the journal of each (name, its earlier line)."""
     job = _Job(source, split, root, options)
-    if workers <= 0 or len(names) < 2:
-        yield from map(job, names)
+    if workers <= 0 or len(items) < 2:
+        yield from map(job, items)
         return
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(
         workers, mp_context=context, initializer=_start, initargs=(job,)
     ) as pool:
-        yield from pool.map(_work, names, chunksize=max(1, min(32, len(names) // (workers * 4))))
+        yield from pool.map(_work, items, chunksize=max(1, min(32, len(items) // (workers * 4))))
 
 
 def _convert_one(record: ImageRecord, split: str, root: Path, options: ConversionOptions) -> dict[str, Any]:
     """Write one image and its labels; return its line of the journal."""
-    size = _image_size(record.image)
+    if record.image.suffix.lower() not in IMAGE_ENDINGS:
+        raise DataError(f"{record.image}: training reads {', '.join(IMAGE_ENDINGS)}; save it as one of these")
+    try:
+        json.dumps([record.name, record.attributes], ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:
+        raise DataError(f"{record.name!r}: its name or attributes are not UTF-8; rename it") from error
+    size = image_size(record.image)
+    if record.size is not None and record.size != size:
+        stated = f"{record.size[1]}x{record.size[0]}"
+        raise DataError(f"{record.image}: is {size[1]}x{size[0]}, its labels are for {stated}; give it at that size")
     dropped = Counter(record.dropped)
     summary: dict[str, Any] = {"name": record.name, "attributes": record.attributes, "labelled": []}
     if record.objects is not None:
@@ -388,34 +455,26 @@ def _mask_of(file: MaskFile, size: tuple[int, int], *, keep_alternative: bool) -
         with Image.open(file.path) as picture:
             picture.load()
             colours = any(isinstance(value, tuple) for value in file.values)
-            if colours:
+            if colours or (not file.values and picture.mode.startswith("RGB")):
                 rgb = np.asarray(picture.convert("RGB")).astype(np.int64)
                 pixels = (rgb[..., 0] << 16) | (rgb[..., 1] << 8) | rgb[..., 2]
             else:
-                plain = picture if picture.mode in {"P", "L", "I", "I;16", "1"} else picture.convert("L")
+                plain = picture if picture.mode in {"P", "L", "1"} or picture.mode[0] == "I" else picture.convert("L")
                 pixels = np.asarray(plain).astype(np.int64)
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
+                if picture.mode == "1" and 1 not in file.values:
+                    pixels *= 255  # a picture of two levels has them as 0 and 255 everywhere else
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise DataError(f"{file.path}: not a mask that can be read ({error})") from error
     if pixels.shape != size:
         raise DataError(f"{file.path}: mask of {pixels.shape[1]}x{pixels.shape[0]}, image of {size[1]}x{size[0]}")
+    if not file.values:
+        return np.where(pixels > 0, 255, 0).astype(np.uint8)
     mask = np.zeros(size, np.uint8)
     for value, meaning in file.values.items():
         code = (value[0] << 16) | (value[1] << 8) | value[2] if isinstance(value, tuple) else value
         level = _level(meaning, keep_alternative=keep_alternative)
         mask[pixels == code] = level
     return mask
-
-
-def _image_size(path: Path) -> tuple[int, int]:
-    """Return (height, width) without decoding the pixels."""
-    try:
-        with Image.open(path) as image:
-            width, height = image.size
-            if image.getexif().get(0x0112, 1) in {5, 6, 7, 8}:
-                width, height = height, width
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
-        raise DataError(f"{path}: not an image that can be read ({error})") from error
-    return height, width
 
 
 def _write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
@@ -447,7 +506,7 @@ def _place_image(source: Path, target: Path, options: ConversionOptions) -> None
         return
     if target.exists():
         there, here = target.stat(), source.stat()
-        if there.st_ino == here.st_ino or (there.st_size, int(there.st_mtime)) == (here.st_size, int(here.st_mtime)):
+        if there.st_ino == here.st_ino or (there.st_size, there.st_mtime_ns) == (here.st_size, here.st_mtime_ns):
             return
     part = target.with_name(f".{target.name}.part")
     part.unlink(missing_ok=True)
@@ -461,18 +520,25 @@ def _place_image(source: Path, target: Path, options: ConversionOptions) -> None
     part.replace(target)
 
 
-def _open_state(root: Path, options: ConversionOptions) -> Path:
+def _open_state(root: Path, options: ConversionOptions, origin: Mapping[str, str]) -> Path:
     """Return the folder of the journals, made if this is a first run.
 
     Raises:
-        OutputError: If the folder is not of a conversion with these options.
+        OutputError: If the folder is not of a conversion of this source with these options.
     """
     state = root / _STATE_FOLDER
-    text = json.dumps(dataclasses.asdict(options), sort_keys=True, indent=1)
+    text = json.dumps({**dataclasses.asdict(options), "source": dict(origin)}, sort_keys=True, indent=1)
     path = state / "options.json"
     if path.is_file():
-        if path.read_text(encoding="utf-8") != text:
-            raise OutputError(f"{root}: holds a conversion with other options; choose another folder or remove it")
+        there = path.read_text(encoding="utf-8")
+        if '"source": {' not in there:
+            raise OutputError(
+                f"{root}: holds a conversion that does not say of what source; choose another folder or remove it"
+            )
+        if there != text:
+            raise OutputError(
+                f"{root}: holds a conversion with other options or another source; choose another folder or remove it"
+            )
         for part in root.rglob(".*.part"):
             part.unlink()
         return state
@@ -484,39 +550,76 @@ def _open_state(root: Path, options: ConversionOptions) -> Path:
     return state
 
 
+def _read_journals(state: Path, order: Iterable[str]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Return the journals of all splits that are there: those of ``order`` first."""
+    there = {path.stem for path in state.glob("*.jsonl")}
+    splits = [*(split for split in order if split in there), *sorted(there - set(order))]
+    return {split: _read_journal(_journal_path(state, split)) for split in splits}
+
+
 def _journal_path(state: Path, split: str) -> Path:
     return state / f"{split}.jsonl"
 
 
-def _read_journal(root: Path, state: Path, split: str, names: set[str]) -> dict[str, dict[str, Any]]:
-    """Return the lines of the images that are done and still there."""
-    path = _journal_path(state, split)
-    if not path.is_file():
-        return {}
-    files = {
-        folder: {entry.name for entry in os.scandir(root / folder / split)}
-        for folder in (IMAGE_FOLDER, DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER)
-    }
-    endings = {
-        "detection": (DETECTION_FOLDER, ".json"),
-        "drivable": (DRIVABLE_FOLDER, ".png"),
-        "lane": (LANE_FOLDER, ".png"),
-    }
-    done: dict[str, dict[str, Any]] = {}
-    lines = path.read_text(encoding="utf-8").splitlines()
-    for line in lines:
+def _read_journal(path: Path) -> dict[str, dict[str, Any]]:
+    """Return image name -> its last line."""
+    lines: dict[str, dict[str, Any]] = {}
+    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
         try:
             summary = json.loads(line)
         except ValueError:
             continue  # the line that an interruption cut off
-        name = summary["name"]
-        if name not in names or "error" in summary or summary["image"] not in files[IMAGE_FOLDER]:
-            continue
-        if all(f"{name}{ending}" in files[folder] for folder, ending in (endings[t] for t in summary["labelled"])):
-            done[name] = summary
-    if lines:
-        _rewrite(path, "".join(json.dumps(summary, sort_keys=True) + "\n" for summary in done.values()))
-    return done
+        lines[summary["name"]] = summary
+    return lines
+
+
+def _journal_text(lines: Mapping[str, Mapping[str, Any]]) -> str:
+    return "".join(json.dumps(lines[name], sort_keys=True) + "\n" for name in sorted(lines))
+
+
+def _files(split: str, summary: Mapping[str, Any]) -> set[str]:
+    """Return the files of an image's line of the journal, from the root."""
+    if "image" not in summary:
+        return set()
+    labels = {f"{_TASK_FILES[task][0]}/{split}/{summary['name']}{_TASK_FILES[task][1]}" for task in summary["labelled"]}
+    return {f"{IMAGE_FOLDER}/{split}/{summary['image']}"} | labels
+
+
+def _is_complete(root: Path, split: str, summary: Mapping[str, Any]) -> bool:
+    """Return whether an image's files are all there."""
+    files = _files(split, summary)
+    return bool(files) and all((root / file).is_file() for file in files)
+
+
+def _remove_files(root: Path, split: str, name: str, keep: Collection[str] = ()) -> None:
+    """Remove what an earlier run wrote of an image and this one does not."""
+    for folder, ending in (*((IMAGE_FOLDER, ending) for ending in IMAGE_ENDINGS), *_TASK_FILES.values()):
+        file = f"{folder}/{split}/{name}{ending}"
+        if file not in keep:
+            (root / file).unlink(missing_ok=True)
+
+
+def _digest(record: ImageRecord) -> str:
+    """Return what changes when the labels change, or the files that they are in or for."""
+    files = [record.image, *(mask.path for mask in (record.drivable, record.lane) if isinstance(mask, MaskFile))]
+    try:
+        facts = [(state.st_size, state.st_mtime_ns) for state in map(Path.stat, files)]
+    except OSError as error:
+        raise DataError(f"{error.filename}: cannot be read ({error.strerror})") from error
+    return hashlib.blake2b(repr((facts, _plain(record))).encode(), digest_size=16).hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    """Return ``value`` in lists, numbers and text, whose ``repr`` is whole and the same for the same labels."""
+    if dataclasses.is_dataclass(value):
+        value = vars(value)
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, dict):
+        return sorted((str(key), _plain(item)) for key, item in value.items())
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return str(value.resolve()) if isinstance(value, Path) else value
 
 
 def _report(summaries: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> ConversionReport:
@@ -536,20 +639,24 @@ def _report(summaries: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Convers
 
 
 def _finish(
-    root: Path, options: ConversionOptions, description: DatasetDescription | None, report: ConversionReport
+    root: Path,
+    options: ConversionOptions,
+    description: DatasetDescription | None,
+    report: ConversionReport,
+    journals: Mapping[str, Mapping[str, Mapping[str, Any]]],
 ) -> None:
     """Write ``dataset.yaml``, ``index.csv`` and ``conversion.json`` for all splits that are there."""
-    state = root / _STATE_FOLDER
     rows: list[dict[str, str]] = []
     columns: list[str] = []
     ignore: tuple[int, ...] = ()
-    for path in sorted(state.glob("*.jsonl")):
-        for line in path.read_text(encoding="utf-8").splitlines():
-            summary = json.loads(line)
+    for split, lines in sorted(journals.items()):
+        for summary in lines.values():
             if "image" in summary:
-                rows.append({"name": summary["name"], "split": path.stem, **summary["attributes"]})
+                # The columns of the layout itself stay its own.
+                own = {f"attribute_{k}" if k in {"name", "split"} else k: v for k, v in summary["attributes"].items()}
+                rows.append({**own, "name": summary["name"], "split": split})
                 ignore = (IGNORE_VALUE,) if summary.get("ignore_value") else ignore
-                columns += [key for key in summary["attributes"] if key not in columns]
+                columns += [key for key in own if key not in columns]
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, ["name", "split", *sorted(columns)], restval="", lineterminator="\n")
     writer.writeheader()
@@ -561,7 +668,7 @@ def _finish(
         description or DatasetDescription(name=root.name),
         classes=dict(options.classes),
         ignore=options.ignore,
-        splits=tuple(sorted(path.stem for path in state.glob("*.jsonl"))),
+        splits=tuple(sorted(split for split, count in report.images.items() if count)),
         attributes=tuple(sorted(columns)),
         drivable=MaskMeaning(values=values, ignore=ignore),
         lane=MaskMeaning(values={255: "lane marking"}, ignore=ignore),

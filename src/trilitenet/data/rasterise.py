@@ -15,10 +15,20 @@ from numpy.typing import NDArray
 
 from trilitenet.errors import DataError
 
-__all__ = ["draw_line", "fill_polygon", "flatten"]
+__all__ = ["check_finite", "draw_line", "fill_polygon", "flatten"]
 
 _STEP = 2.0
 """A curve is sampled about every so many pixels."""
+
+
+def check_finite(points: NDArray[np.float64]) -> None:
+    """Refuse coordinates that no pixel has.
+
+    Raises:
+        DataError: If one is infinite or not a number.
+    """
+    if not np.isfinite(points).all():
+        raise DataError("a polygon or line with a coordinate that is not a number")
 
 
 def flatten(vertices: Sequence[Sequence[float]], types: str, *, closed: bool) -> NDArray[np.float64]:
@@ -43,8 +53,7 @@ def flatten(vertices: Sequence[Sequence[float]], types: str, *, closed: bool) ->
     types = types or "L" * len(points)
     if points.ndim != 2 or points.shape[1] != 2 or len(points) != len(types) or set(types) - {"L", "C"}:
         raise DataError(f"poly2d needs one letter L or C a vertex, got {len(points)} vertices and {types!r}")
-    if not np.isfinite(points).all():
-        raise DataError("poly2d with a coordinate that is not a number")
+    check_finite(points)
     if closed:
         points = np.concatenate([points, points[:1]])
     parts = [points[:1]]
@@ -70,7 +79,11 @@ def fill_polygon(mask: NDArray[np.uint8], points: NDArray[np.float64], value: in
         mask: (H, W) uint8, changed in place.
         points: (N, 2) x, y; the last is joined to the first.
         value: What to set.
+
+    Raises:
+        DataError: If a coordinate is not finite.
     """
+    check_finite(points)
     if len(points) < 3:
         return
     height, width = mask.shape
@@ -105,7 +118,11 @@ def draw_line(mask: NDArray[np.uint8], points: NDArray[np.float64], width: float
         points: (N, 2) x, y; one point is a disc.
         width: Pixels.
         value: What to set.
+
+    Raises:
+        DataError: If a coordinate is not finite.
     """
+    check_finite(points)
     radius = width / 2
     if len(points) == 1:
         points = np.repeat(points, 2, axis=0)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-import pycocotools.mask
 from numpy.typing import NDArray
+from PIL import Image
 
-from trilitenet.errors import DataError
+from trilitenet.errors import DataError, ShapeError
+from trilitenet.processing.serialise import decode_mask
 
 __all__ = [
     "AreaLabel",
@@ -24,6 +25,8 @@ __all__ = [
     "RecordSource",
     "RowRuns",
     "RunLabel",
+    "image_size",
+    "same_name",
 ]
 
 
@@ -83,15 +86,11 @@ class RowRuns:
         Raises:
             DataError: If the runs do not fill the box, or the box reaches out of the image.
         """
-        inside = np.repeat(np.arange(len(self.runs)) % 2 == 1, self.runs)
-        if len(inside) != self.width * self.height:
-            raise DataError(f"a mask of {self.width}x{self.height} with runs for {len(inside)} pixels")
-        if min(self.left, self.top) < 0 or self.left + self.width > size[1] or self.top + self.height > size[0]:
+        bottom, right = self.top + self.height, self.left + self.width
+        if min(self.left, self.top, self.width, self.height) < 0 or right > size[1] or bottom > size[0]:
             raise DataError(f"a mask that reaches out of an image of {size[1]}x{size[0]}")
         mask = np.zeros(size, np.bool_)
-        mask[self.top : self.top + self.height, self.left : self.left + self.width] = inside.reshape(
-            self.height, self.width
-        )
+        mask[self.top : bottom, self.left : right] = _spread(self.runs, self.height, self.width)
         return mask
 
 
@@ -113,21 +112,32 @@ class CocoRuns:
         """Return the region as (height, width) bool.
 
         Raises:
-            DataError: If the runs are for another size.
+            DataError: If the runs are for another size, do not fill it, or are no run lengths.
         """
         if self.size != size:
             raise DataError(f"a run-length mask of {self.size[1]}x{self.size[0]}, image of {size[1]}x{size[0]}")
         if isinstance(self.counts, str):
-            runs = pycocotools.mask.decode({"size": list(size), "counts": self.counts.encode()})
-            return np.asarray(runs, np.bool_)
-        inside = np.repeat(np.arange(len(self.counts)) % 2 == 1, self.counts)
-        if len(inside) != size[0] * size[1]:
-            raise DataError(f"a run-length mask with {len(inside)} pixels, image of {size[1]}x{size[0]}")
-        mask: NDArray[np.bool_] = inside.reshape(size[1], size[0]).T
+            try:
+                return decode_mask({"size": size, "counts": self.counts})
+            except ShapeError as error:
+                raise DataError(str(error)) from error
+        mask: NDArray[np.bool_] = _spread(self.counts, size[1], size[0]).T
         return mask
 
 
 RunLabel = RowRuns | CocoRuns
+
+
+def _spread(runs: Sequence[int], lines: int, length: int) -> NDArray[np.bool_]:
+    """Return run lengths, in turn outside and inside, as (lines, length) bool.
+
+    Raises:
+        DataError: If they do not fill it.
+    """
+    if min(runs, default=0) < 0 or sum(runs) != lines * length:
+        raise DataError(f"a run-length mask whose runs are negative or do not fill its {lines * length} pixels")
+    inside: NDArray[np.bool_] = np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(lines, length)
+    return inside
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -158,7 +168,8 @@ class MaskFile:
     Attributes:
         path: The picture.
         values: Pixel value -> ``"direct"``, ``"alternative"``, ``"foreground"``, ``"ignore"``; other values are
-            background. Keys are grey levels or indices (int), or ``(red, green, blue)``.
+            background. Keys are grey levels or indices (int), or ``(red, green, blue)``. Empty: every value above 0
+            is foreground.
     """
 
     path: Path
@@ -177,6 +188,7 @@ class ImageRecord:
         lane: Lane markings, as lines or as a picture.
         attributes: Weather, scene, time of day and the like.
         dropped: What the reader could not use: reason -> count.
+        size: (height, width) that the labels were made for; None = the format does not say.
     """
 
     name: str
@@ -186,6 +198,30 @@ class ImageRecord:
     lane: tuple[LaneLabel | RunLabel, ...] | MaskFile | None = None
     attributes: dict[str, str] = dataclasses.field(default_factory=dict)
     dropped: dict[str, int] = dataclasses.field(default_factory=dict)
+    size: tuple[int, int] | None = None
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Return an image's (height, width), turned as its EXIF data say, without decoding the pixels.
+
+    Raises:
+        DataError: If it is not an image.
+    """
+    try:
+        with Image.open(path) as image:
+            width, height = image.size
+            if image.getexif().get(0x0112, 1) in {5, 6, 7, 8}:
+                width, height = height, width
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise DataError(f"{path}: not an image that can be read ({error})") from error
+    return height, width
+
+
+def same_name(name: str, split: str, one: Path, two: Path) -> DataError:
+    """Return the error that two images of a split would get the same files."""
+    if one == two:
+        return DataError(f"{one}: is listed twice in split {split!r}; list it once, or convert one label file alone")
+    return DataError(f"two images are called {name!r} in split {split!r}: {one} and {two}; rename one and its labels")
 
 
 class ListedRecords:
@@ -194,19 +230,26 @@ class ListedRecords:
     Args:
         records: Split -> records.
         found: One line for each thing that was found, for the user.
+        origin: See `RecordSource`.
 
     Raises:
         DataError: If two images of a split have one name.
     """
 
-    def __init__(self, records: Mapping[str, Iterable[ImageRecord]], found: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self,
+        records: Mapping[str, Iterable[ImageRecord]],
+        found: tuple[str, ...] = (),
+        origin: Mapping[str, str] | None = None,
+    ) -> None:
         self.found = found
+        self.origin = dict(origin or {})
         self._records: dict[str, dict[str, ImageRecord]] = {}
         for split, items in records.items():
             own = self._records.setdefault(split, {})
             for item in items:
                 if item.name in own:
-                    raise DataError(f"two images are called {item.name!r} in split {split!r}: {own[item.name].image}")
+                    raise same_name(item.name, split, own[item.name].image, item.image)
                 own[item.name] = item
 
     @property
@@ -225,6 +268,10 @@ class ListedRecords:
 
 class RecordSource(Protocol):
     """A foreign data set: names first, each record when it is wanted, from any process (so it must be picklable)."""
+
+    @property
+    def origin(self) -> Mapping[str, str]:
+        """What tells this source from another: its kind, its path, what its names mean. A conversion keeps to one."""
 
     @property
     def splits(self) -> tuple[str, ...]:

@@ -152,3 +152,15 @@ def test_a_broken_document_is_counted_and_the_rest_converted(tmp_path: Path) -> 
     report = convert(read_bdd100k(raw), tmp_path / "out")
     assert report.images == {"train": 1, "val": 1}
     assert report.dropped["train"]["image: labels or image broken"] == 1
+
+
+@pytest.mark.parametrize("ascii_only", [False, True])
+def test_names_beyond_ascii_keep_their_labels(tmp_path: Path, ascii_only: bool) -> None:
+    raw = tmp_path / "raw"
+    raw_bdd.write_images(raw)
+    raw_bdd.write_2018_merged(raw)
+    path = raw / "labels/bdd100k_labels_images_train.json"
+    content = json.loads(path.read_text().replace("a1.jpg", "stra\u00dfe \u65e5.jpg"))
+    path.write_text(json.dumps(content, ensure_ascii=ascii_only), encoding="utf-8")
+    (raw / "images/100k/train/a1.jpg").rename(raw / "images/100k/train/stra\u00dfe \u65e5.jpg")
+    assert read_bdd100k(raw).record("train", "stra\u00dfe \u65e5").objects

@@ -11,7 +11,7 @@ import pytest
 from tests.formats.readers.conftest import SIZE
 from trilitenet.data.converting import ConversionOptions, convert
 from trilitenet.data.reading import DrivingDataset
-from trilitenet.errors import DataError
+from trilitenet.errors import DataError, OutputError
 from trilitenet.formats.readers.coco import read_coco
 from trilitenet.formats.readers.mapping import LabelMapping
 from trilitenet.formats.writers.base import open_writer
@@ -61,11 +61,11 @@ def test_polygons_crowds_and_layouts(tmp_path: Path, place: str) -> None:
     folder.mkdir(exist_ok=True)
     cv2.imwrite(str(folder / "one.png"), np.zeros((*SIZE, 3), np.uint8))
     source = read_coco(tmp_path, LabelMapping(drivable=("road",), ignore=("mud",)))
-    report = convert(source, tmp_path / "out", ConversionOptions(classes={"vehicle": ("car",)}))
+    report = convert(source, tmp_path / "out", ConversionOptions(classes={"vehicle": ("car",)}, ignore=("mud",)))
     sample = DrivingDataset(tmp_path / "out", "val")[0]
     assert sample.boxes is not None
     assert sample.boxes.tolist() == [[10, 2, 40, 6]]
-    assert sample.ignored.tolist() == [[1, 2, 4, 6]]
+    assert sample.ignored.tolist() == [[1, 2, 4, 6], [0, 0, 1, 1]]
     assert sample.drivable is not None
     assert sample.drivable.sum() == 400
     assert sample.drivable[20:40, 10:30].all()
@@ -100,6 +100,96 @@ def test_errors(tmp_path: Path) -> None:
     path.write_text(json.dumps(coco()))
     with pytest.raises(DataError, match="none of the images"):
         read_coco(path)
-    path.write_text(json.dumps(coco(annotations=[{"hello": 1}])))
-    with pytest.raises(DataError, match="not as COCO has it"):
-        read_coco(path)
+    road = {"image_id": 7, "category_id": 2, "bbox": [0, 0, 1, 1]}
+    for annotation in (
+        {"hello": 1},
+        {**road, "segmentation": {"size": [1], "counts": "0"}},
+        {**road, "segmentation": {"size": [48, float("inf")], "counts": "0"}},
+    ):
+        path.write_text(json.dumps(coco(annotations=[annotation])))
+        cv2.imwrite(str(tmp_path / "one.png"), np.zeros((*SIZE, 3), np.uint8))
+        with pytest.raises(DataError, match="not as COCO has it"):
+            read_coco(path, LabelMapping(drivable=("road",)))
+
+
+def write(path: Path, content: dict[str, Any] | None = None) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if content is None:
+        cv2.imwrite(str(path), np.zeros((*SIZE, 3), np.uint8))
+    else:
+        path.write_text(json.dumps(content))
+
+
+def test_ignored_categories_keep_their_boxes_where_areas_are_not_labelled(tmp_path: Path) -> None:
+    write(tmp_path / "one.png")
+    write(tmp_path / "labels.json", coco())
+    record = read_coco(tmp_path / "labels.json", LabelMapping(ignore=("mud",))).record("train", "one")
+    assert record.drivable is None
+    assert record.objects is not None
+    assert [(item.category, item.crowd) for item in record.objects if item.category == "mud"] == [("mud", True)]
+
+
+def test_coco_as_downloaded(tmp_path: Path) -> None:
+    """Files of captions and of key points lie beside those of instances."""
+    for split in ("train", "val"):
+        write(tmp_path / f"{split}2017/one.png")
+        write(tmp_path / f"annotations/instances_{split}2017.json", coco())
+        write(tmp_path / f"annotations/person_keypoints_{split}2017.json", coco(annotations=[]))
+        write(tmp_path / f"annotations/captions_{split}2017.json", coco(annotations=[{"image_id": 7, "caption": "a"}]))
+    source = read_coco(tmp_path)
+    assert source.splits == ("train", "val")
+    assert len(source.record("val", "one").objects or ()) == 5
+    assert source.found[-1].startswith("not used: captions_train2017.json, captions_val2017.json, person_keypoints_")
+
+
+@pytest.mark.parametrize("place", ["val2017", "images/val", "images", "annotations/images", "."])
+def test_a_single_file_finds_its_images(tmp_path: Path, place: str) -> None:
+    write(tmp_path / place / "one.png")
+    write(tmp_path / "annotations/instances_val2017.json", coco())
+    assert read_coco(tmp_path / "annotations/instances_val2017.json").names("train") == ["one"]
+
+
+@pytest.mark.parametrize(
+    ("path", "split"),
+    [("val/train.json", "train"), ("train/_annotations.coco.json", "train"), ("test/labels.json", "val")],
+)
+def test_the_file_names_its_split_before_its_folder(tmp_path: Path, path: str, split: str) -> None:
+    write(tmp_path / path, coco())
+    write((tmp_path / path).with_name("one.png"))
+    assert read_coco((tmp_path / path).parent, LabelMapping(split="val")).splits == (split,)
+
+
+def test_labels_made_at_another_size_are_left_out(tmp_path: Path) -> None:
+    sizes = {"one": SIZE, "two": (SIZE[0] * 20, SIZE[1] * 20), "three": (0, 0)}
+    images = [
+        {"id": index, "file_name": f"{name}.png", "height": size[0], "width": size[1]}
+        for index, (name, size) in enumerate(sizes.items())
+    ]
+    for name in sizes:
+        write(tmp_path / f"{name}.png")
+    write(tmp_path / "labels.json", coco(images=images, annotations=[]))
+    report = convert(read_coco(tmp_path), tmp_path / "out")
+    assert DrivingDataset(tmp_path / "out", "train").names == ["one", "three"]
+    assert report.dropped["train"] == {"image: labels or image broken": 1}
+
+
+def test_a_split_without_images_is_left_out(tmp_path: Path) -> None:
+    write(tmp_path / "train/one.png")
+    for split in ("train", "val"):
+        write(tmp_path / f"annotations/instances_{split}.json", coco())
+    (tmp_path / "train/one.png").rename(tmp_path / "train/other.png")
+    write(
+        tmp_path / "annotations/instances_train.json", coco(images=[{**coco()["images"][0], "file_name": "other.png"}])
+    )
+    assert read_coco(tmp_path).splits == ("train",)
+
+
+def test_a_conversion_keeps_to_its_source_and_mapping(tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        write(tmp_path / folder / "one.png")
+        write(tmp_path / folder / "labels.json", coco())
+    convert(read_coco(tmp_path / "a"), tmp_path / "out")
+    convert(read_coco(tmp_path / "a", LabelMapping(licence="CC0")), tmp_path / "out")
+    for source in (read_coco(tmp_path / "b"), read_coco(tmp_path / "a", LabelMapping(drivable=("road",)))):
+        with pytest.raises(OutputError, match="another source"):
+            convert(source, tmp_path / "out")

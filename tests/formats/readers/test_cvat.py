@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,7 @@ import pytest
 from tests.formats.readers.conftest import SIZE
 from trilitenet.data.converting import ConversionOptions, convert
 from trilitenet.data.reading import DrivingDataset
+from trilitenet.data.records import ImageRecord, ObjectLabel
 from trilitenet.errors import DataError
 from trilitenet.formats.readers.cvat import read_cvat
 from trilitenet.formats.readers.mapping import LabelMapping
@@ -91,3 +93,61 @@ def test_errors(tmp_path: Path) -> None:
     path.write_text(XML.replace('xtl="1"', 'xtl="x"'))
     with pytest.raises(DataError, match="not as CVAT has it"):
         read_cvat(tmp_path)
+
+
+def read_shapes(
+    tmp_path: Path, shapes: str, mapping: LabelMapping, size: str = 'width="80" height="48"'
+) -> ImageRecord:
+    """Read an image with these shapes."""
+    (tmp_path / "annotations.xml").write_text(
+        f'<annotations><image id="0" name="one.png" {size}>{shapes}</image></annotations>'
+    )
+    cv2.imwrite(str(tmp_path / "one.png"), np.zeros((*SIZE, 3), np.uint8))
+    return read_cvat(tmp_path, mapping).record("train", "one")
+
+
+def test_crowd_is_no_text(tmp_path: Path) -> None:
+    """CVAT writes the attribute of every box, and its text 'false' would be true."""
+    box = '<box label="car" xtl="1" ytl="2" xbr="9" ybr="7"><attribute name="crowd">{}</attribute></box>'
+    record = read_shapes(tmp_path, "".join(map(box.format, ("false", "true"))), LabelMapping())
+    assert record.objects is not None
+    assert [(item.crowd, item.attributes["crowd"]) for item in record.objects] == [(False, False), (True, True)]
+    convert(read_cvat(tmp_path), tmp_path / "out")
+    content = json.loads((tmp_path / "out/det_annotations/train/one.json").read_text())
+    assert [item["attributes"]["crowd"] for item in content["frames"][0]["objects"]] == [False, True]
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        '<polygon label="mud" points="10,20;30,20;30,40;10,40"></polygon>',
+        '<mask label="mud" rle="0, 400" left="10" top="20" width="20" height="20"></mask>',
+    ],
+)
+def test_ignored_shapes_are_area_and_object(tmp_path: Path, shape: str) -> None:
+    record = read_shapes(tmp_path, shape, LabelMapping(ignore=("mud",), tasks=("detection", "drivable")))
+    assert record.objects == (ObjectLabel("mud", (10, 20, 30, 40), crowd=True),)
+    assert [area.kind for area in record.drivable or ()] == ["ignore"]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("degrees", "corners"),
+    [("90.0", (20, 10, 40, 50)), ("180", (10, 20, 50, 40)), ("315", (8.787, 8.787, 51.213, 51.213))],
+)
+def test_turned_boxes(tmp_path: Path, degrees: str, corners: tuple[float, ...]) -> None:
+    box = f'<box label="car" xtl="10" ytl="20" xbr="50" ybr="40" rotation="{degrees}"></box>'
+    record = read_shapes(tmp_path, box, LabelMapping())
+    assert record.objects is not None
+    assert record.objects[0].box == pytest.approx(corners, abs=1e-3)
+
+
+@pytest.mark.parametrize(("size", "images"), [('width="80" height="48"', 1), ("", 1), ('width="160" height="96"', 0)])
+def test_labels_made_at_another_size_are_left_out(tmp_path: Path, size: str, images: int) -> None:
+    read_shapes(tmp_path, '<box label="car" xtl="1" ytl="2" xbr="9" ybr="7"></box>', LabelMapping(), size)
+    assert convert(read_cvat(tmp_path), tmp_path / "out").images == {"train": images}
+
+
+@pytest.mark.parametrize("points", ["1;2;3;4", "1,2,3;4,5,6", "1,2;3"])
+def test_points_are_pairs(tmp_path: Path, points: str) -> None:
+    with pytest.raises(DataError, match="not as CVAT has it"):
+        read_shapes(tmp_path, f'<polygon label="car" points="{points}"></polygon>', LabelMapping())

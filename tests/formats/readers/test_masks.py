@@ -76,9 +76,16 @@ def test_what_was_written_comes_back(root: Path, tmp_path: Path) -> None:
 
 
 def test_default_is_everything_above_zero(tmp_path: Path) -> None:
-    assert len(MaskRule("x").meanings()) == 255
+    assert MaskRule("x").meanings() == {}
     with pytest.raises(DataError, match="no images"):
         read_masks(tmp_path)
+
+
+def test_tasks_choose_the_masks_that_are_read(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "mapping.yaml").write_text(f"{YAML}tasks: [lane]\n")
+    record = read_masks(root, read_mapping(tmp_path / "mapping.yaml")).record("train", "a")
+    assert record.drivable is None
+    assert record.lane is not None
 
 
 def test_a_mask_of_another_size_is_counted(root: Path, tmp_path: Path) -> None:

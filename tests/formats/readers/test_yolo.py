@@ -5,10 +5,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.formats.readers.conftest import SIZE
 from trilitenet.data.converting import ConversionOptions, convert
 from trilitenet.data.reading import DrivingDataset
+from trilitenet.data.records import ObjectLabel
 from trilitenet.errors import DataError
 from trilitenet.formats.readers.mapping import LabelMapping
 from trilitenet.formats.readers.yolo import read_yolo
@@ -82,3 +84,50 @@ def test_errors(tmp_path: Path) -> None:
     (tmp_path / "data.yaml").write_text("names: [car]\ntrain: images/train\n")
     with pytest.raises(DataError, match="no images"):
         read_yolo(tmp_path)
+    (tmp_path / "data.yaml").write_bytes("names: [K\u00e4fer]".encode("latin-1"))
+    with pytest.raises(DataError, match=r"data\.yaml: not text in UTF-8"):
+        read_yolo(tmp_path)
+
+
+def test_labels_that_are_not_utf8_or_no_numbers(root: Path) -> None:
+    (root / "labels/train/a.txt").write_bytes(b"0 0.5 0.5 0.5 0.5 \xe9")
+    with pytest.raises(DataError, match=r"a\.txt: not text in UTF-8"):
+        read_yolo(root).record("train", "a")
+    (root / "labels/train/a.txt").write_text("inf 0.5 0.5 0.5 0.5")
+    with pytest.raises(DataError, match=r"a\.txt, line 1: not numbers"):
+        read_yolo(root).record("train", "a")
+
+
+@pytest.mark.parametrize("other", ["images/train/more/a.jpg", "images/train/a.png"])
+def test_images_of_one_name_are_refused(root: Path, other: str) -> None:
+    (root / other).parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(root / other), np.zeros((*SIZE, 3), np.uint8))
+    with pytest.raises(DataError, match=r"two images are called 'a' in split 'train': .*a\.\w+ and .*a\.\w+; rename"):
+        read_yolo(root)
+
+
+def test_ignored_polygons_are_area_and_object(root: Path) -> None:
+    (root / "labels/train/a.txt").write_text("1 0.25 0.5 0.5 0.5 0.5 1.0 0.25 1.0\n")
+    record = read_yolo(root, LabelMapping(ignore=("road",), tasks=("detection", "drivable"))).record("train", "a")
+    assert record.objects == (ObjectLabel("road", (20, 24, 40, 48), crowd=True),)
+    assert [area.kind for area in record.drivable or ()] == ["ignore"]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(("turn", "box"), [(1, (20, 12, 60, 36)), (6, (12, 20, 36, 60)), (8, (12, 20, 36, 60))])
+def test_boxes_are_parts_of_the_turned_image(root: Path, turn: int, box: tuple[float, ...]) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = turn
+    Image.new("RGB", SIZE[::-1]).save(root / "images/train/a.jpg", exif=exif)
+    (root / "labels/train/a.txt").write_text("0 0.5 0.5 0.5 0.5\n")
+    record = read_yolo(root).record("train", "a")
+    assert record.objects is not None
+    assert record.objects[0].box == box
+
+
+def test_lists_of_images(root: Path) -> None:
+    cv2.imwrite(str(root / "images/train/b c.jpg"), np.zeros((*SIZE, 3), np.uint8))
+    (root / "train.txt").write_text("images/train/a.jpg\n  images/train/b c.jpg \n\nimages/train/gone.jpg\n")
+    (root / "data.yaml").write_text("train: train.txt\nnames: [car]\n")
+    source = read_yolo(root)
+    assert source.names("train") == ["a", "b c"]
+    assert source.found == ("train: 2 images", "train: 1 listed images are not there")

@@ -97,12 +97,13 @@ class BddSource:
     """
 
     def __init__(
-        self, splits: Mapping[str, _Split], found: tuple[str, ...], *, crosswalk: bool, vertical: bool
+        self, root: Path, splits: Mapping[str, _Split], found: tuple[str, ...], *, crosswalk: bool, vertical: bool
     ) -> None:
         self._splits = dict(splits)
         self._crosswalk = crosswalk
         self._vertical = vertical
         self.found = found
+        self.origin = {"kind": "bdd100k", "path": str(root.resolve())}
 
     @property
     def splits(self) -> tuple[str, ...]:
@@ -183,7 +184,7 @@ def read_bdd100k(raw: str | Path, *, crosswalk: bool = False, vertical: bool = F
             f"{root}: no BDD100K images; looked for folders images/100k/{{train,val,test}} (or images/train, ...) with "
             ".jpg files at any depth"
         )
-    return BddSource(splits, tuple(found), crosswalk=crosswalk, vertical=vertical)
+    return BddSource(root, splits, tuple(found), crosswalk=crosswalk, vertical=vertical)
 
 
 def parse_labels(content: Any, image: Path, source: str, tasks: Collection[Task] = TASKS) -> ImageRecord:
@@ -307,17 +308,21 @@ def _entries(files: _Split, name: str) -> Iterator[tuple[Any, Path]]:
     for part in files.parts.get(name, ()):
         with part.path.open("rb") as file:
             file.seek(part.start)
-            yield json.loads(file.read(part.length)), part.path
+            yield _parse(file.read(part.length), part.path), part.path
     if files.documents is not None:
         path = files.documents / f"{name}.json"
         try:
             text = path.read_bytes()
         except FileNotFoundError:
             return
-        try:
-            yield json.loads(text), path
-        except ValueError as error:
-            raise DataError(f"{path}: not JSON ({error})") from error
+        yield _parse(text, path), path
+
+
+def _parse(text: bytes, path: Path) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise DataError(f"{path}: not JSON ({brief(error)})") from error
 
 
 def _tasks_of(path: Path) -> frozenset[Task]:
@@ -411,6 +416,8 @@ def _index(path: Path) -> Iterator[tuple[str, _Part, dict[str, Any]]]:
                 continue
             if not isinstance(entry, dict) or "name" not in entry:
                 raise DataError(f"{path}: an entry without 'name' near byte {base + position}")
+            if not str(entry["name"]).isascii():
+                entry = _parse(text[position:end].encode("latin-1"), path)
             yield Path(str(entry["name"])).stem, _Part(path, base + position, end - position), entry
             position = end
 

@@ -1,7 +1,8 @@
 """COCO's annotation file: boxes, polygons and run-length masks in one JSON a split.
 
 Format: https://cocodataset.org/#format-data. Found are ``annotations/*_{split}*.json`` (COCO itself),
-``{split}/_annotations.coco.json`` (Roboflow) and single files, whose images belong to one split.
+``{split}/_annotations.coco.json`` (Roboflow) and single files, whose images belong to one split. Where a split has
+``instances_*`` files, others of it are left out, and so are files without categories (captions).
 """
 
 from __future__ import annotations
@@ -36,39 +37,55 @@ def read_coco(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
     root = Path(root)
     records: dict[str, list[ImageRecord]] = defaultdict(list)
     found = []
-    for path, split in _annotation_files(root, mapping.split):
-        items, missing = _read_file(path, split, root if root.is_dir() else root.parent, mapping)
+    folders = [root if root.is_dir() else root.parent]
+    if root.is_file() and folders[0].resolve().name == "annotations":
+        folders.append(folders[0].resolve().parent)
+    chosen, unused = _annotation_files(root, mapping.split)
+    for path, split in chosen:
+        items, missing = _read_file(path, split, folders, mapping)
         records[split] += items
         found.append(f"{split}: {len(items)} images of {path.name}; {missing} more are not there")
     if not any(records.values()):
         raise DataError(f"{root}: none of the images of its annotation files is there")
-    return ListedRecords(records, tuple(found))
+    if unused:
+        found.append(f"not used: {', '.join(path.name for path in unused)}")
+    splits = {split: items for split, items in records.items() if items}
+    return ListedRecords(splits, tuple(found), mapping.origin("coco", root))
 
 
-def _annotation_files(root: Path, default: str) -> list[tuple[Path, str]]:
+def _annotation_files(root: Path, default: str) -> tuple[list[tuple[Path, str]], list[Path]]:
+    """Return (file, split) of the files to read, and the files that are left out for them."""
     if root.is_file():
-        return [(root, default)]
+        return [(root, default)], []
     files = sorted({*root.glob("*.json"), *root.glob("annotations/*.json"), *root.glob("*/_annotations.coco.json")})
-    chosen = [(path, _split_of(path, default)) for path in files if _is_coco(path)]
+    splits = {path: _split_of(path, default) for path in files if _is_coco(path)}
+    whole = {split for path, split in splits.items() if path.name.startswith("instances_")}
+    chosen = [
+        (path, split) for path, split in splits.items() if path.name.startswith("instances_") or split not in whole
+    ]
     if not chosen:
         raise DataError(
             f"{root}: no COCO annotations; looked for *.json, annotations/*.json and */_annotations.coco.json with "
-            "the keys 'images' and 'annotations'"
+            "the keys 'images' and 'annotations', and a 'category_id' in these"
         )
-    return chosen
+    return chosen, [path for path in files if path not in dict(chosen)]
 
 
 def _is_coco(path: Path) -> bool:
     content = read_json(path)
-    return isinstance(content, dict) and {"images", "annotations"} <= set(content)
+    if not isinstance(content, dict) or not {"images", "annotations"} <= set(content):
+        return False
+    items = content["annotations"]
+    return not items or (isinstance(items, list) and any("category_id" in item for item in items))
 
 
 def _split_of(path: Path, default: str) -> str:
-    words = [*re.split(r"[^a-z]+", path.stem.lower()), path.parent.name.lower()]
+    stem = path.parent.name if path.name == "_annotations.coco.json" else path.stem
+    words = re.split(r"[^a-z]+", stem.lower())
     return next((_SPLIT_NAMES[word] for word in reversed(words) if word in _SPLIT_NAMES), default)
 
 
-def _read_file(path: Path, split: str, root: Path, mapping: LabelMapping) -> tuple[list[ImageRecord], int]:
+def _read_file(path: Path, split: str, roots: list[Path], mapping: LabelMapping) -> tuple[list[ImageRecord], int]:
     content = read_json(path)
     try:
         names = {item["id"]: str(item["name"]) for item in content.get("categories", ())}
@@ -76,8 +93,12 @@ def _read_file(path: Path, split: str, root: Path, mapping: LabelMapping) -> tup
         for item in content["annotations"]:
             labels[item["image_id"]].append(item)
         tasks = mapping.labelled(set(names.values()))
-        folders = [path.parent, root, root / "images", root / split, root / "images" / split]
-        folders += [folder for folder in sorted(root.glob(f"*{split}*")) if folder.is_dir()]
+        folders = [path.parent]
+        for root in roots:
+            folders += [root, root / "images"]
+            for word in dict.fromkeys([_split_of(path, split), split]):  # a single file's name may say where to look
+                folders += [root / word, root / "images" / word]
+                folders += [folder for folder in sorted(root.glob(f"*{word}*")) if folder.is_dir()]
         records, missing = [], 0
         for image in content["images"]:
             place = find_image(str(image["file_name"]), folders)
@@ -85,7 +106,7 @@ def _read_file(path: Path, split: str, root: Path, mapping: LabelMapping) -> tup
                 missing += 1
                 continue
             size = (int(image["height"]), int(image["width"]))
-            objects, shapes, dropped = _read_labels(labels[image["id"]], names, size, mapping)
+            objects, shapes, dropped = _read_labels(labels[image["id"]], names, mapping)
             records.append(
                 ImageRecord(
                     name=place.stem,
@@ -95,15 +116,16 @@ def _read_file(path: Path, split: str, root: Path, mapping: LabelMapping) -> tup
                     lane=tuple(shapes.lanes) if "lane" in tasks else None,
                     attributes={str(key): str(value) for key, value in (image.get("attributes") or {}).items()},
                     dropped=dict(dropped),
+                    size=size if all(size) else None,
                 )
             )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise DataError(f"{path}: not as COCO has it ({brief(error)})") from error
     return records, missing
 
 
 def _read_labels(
-    items: list[dict[str, Any]], names: dict[Any, str], size: tuple[int, int], mapping: LabelMapping
+    items: list[dict[str, Any]], names: dict[Any, str], mapping: LabelMapping
 ) -> tuple[list[ObjectLabel], Shapes, Counter[str]]:
     objects: list[ObjectLabel] = []
     shapes = Shapes()
@@ -111,12 +133,13 @@ def _read_labels(
     for item in items:
         category = names.get(item["category_id"], str(item["category_id"]))
         kind = mapping.area_kind(category)
-        if category not in mapping.lane and (kind is None or (kind == "ignore" and not item.get("segmentation"))):
-            left, top, width, height = (float(value) for value in item["bbox"])
-            crowd = bool(item.get("iscrowd"))
-            objects.append(ObjectLabel(category, (left, top, left + width, top + height), crowd))
-            continue
         segmentation = item.get("segmentation")
+        if category not in mapping.lane and kind in {None, "ignore"}:
+            left, top, width, height = (float(value) for value in item["bbox"])
+            crowd = bool(item.get("iscrowd")) or kind == "ignore"
+            objects.append(ObjectLabel(category, (left, top, left + width, top + height), crowd))
+            if kind is None or not segmentation:
+                continue
         if not segmentation:
             dropped[f"{category}: without a segmentation"] += 1
         elif isinstance(segmentation, dict):

@@ -6,6 +6,7 @@ attributes of an image's tags become the image's.
 
 from __future__ import annotations
 
+import math
 from collections import Counter, defaultdict
 from pathlib import Path
 from xml.etree import ElementTree
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ListedRecords, ObjectLabel, RowRuns
 from trilitenet.errors import DataError, brief
-from trilitenet.formats.readers.mapping import LabelMapping, Shapes, find_image
+from trilitenet.formats.readers.mapping import LabelMapping, Shapes, find_image, hull
 
 __all__ = ["read_cvat"]
 
@@ -48,7 +49,7 @@ def read_cvat(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
     found = [f"{split}: {len(items)} images" for split, items in records.items()]
     if missing:
         found.append(f"{missing} listed images are not there")
-    return ListedRecords(records, tuple(found))
+    return ListedRecords(records, tuple(found), mapping.origin("cvat", root))
 
 
 def _read_file(path: Path, folder: Path, mapping: LabelMapping, records: dict[str, list[ImageRecord]]) -> int:
@@ -81,6 +82,7 @@ def _read_file(path: Path, folder: Path, mapping: LabelMapping, records: dict[st
             continue
         try:
             objects, shapes, attributes, dropped = _read_image(element, mapping)
+            size = (int(element.get("height") or 0), int(element.get("width") or 0))
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"{path}: image {name!r} is not as CVAT has it ({brief(error)})") from error
         records[split].append(
@@ -92,6 +94,7 @@ def _read_file(path: Path, folder: Path, mapping: LabelMapping, records: dict[st
                 lane=tuple(shapes.lanes) if "lane" in tasks else None,
                 attributes=attributes,
                 dropped=dict(dropped),
+                size=size if all(size) else None,
             )
         )
     return missing
@@ -111,36 +114,49 @@ def _read_image(
         if shape.tag == "tag":
             attributes |= own
         elif shape.tag == "box":
-            x1, y1, x2, y2 = (float(shape.attrib[key]) for key in ("xtl", "ytl", "xbr", "ybr"))
-            crowd = own.get("crowd", "").lower() == "true"
-            objects.append(
-                ObjectLabel(label, (x1, y1, x2, y2), crowd, {**own, "occluded": shape.get("occluded") == "1"})
-            )
+            # Text, of which "false" would be true.
+            crowd = own.pop("crowd", "").strip().lower() == "true"
+            more: dict[str, str | bool | float] = {**own, "crowd": crowd, "occluded": shape.get("occluded") == "1"}
+            objects.append(ObjectLabel(label, _box(shape), crowd, more))
         elif shape.tag in {"polygon", "polyline"}:
             points = _points(shape.attrib["points"])
             if label in mapping.lane:
                 closed = shape.tag == "polygon"
                 shapes.lanes.append(LaneLabel(label, points, closed=closed, edge=mapping.lane_edges and not closed))
-            elif kind is not None and shape.tag == "polygon":
+                continue
+            if kind is not None and shape.tag == "polygon":
                 shapes.areas.append(AreaLabel(kind, points))
-            else:
-                low, high = points.min(axis=0), points.max(axis=0)
-                objects.append(ObjectLabel(label, (float(low[0]), float(low[1]), float(high[0]), float(high[1]))))
+            if kind in {None, "ignore"} or shape.tag == "polyline":
+                objects.append(ObjectLabel(label, hull(points), crowd=kind == "ignore"))
         elif shape.tag == "mask":
             left, top, width, height = (int(shape.attrib[key]) for key in ("left", "top", "width", "height"))
             lengths = tuple(int(run) for run in shape.attrib["rle"].split(","))
             runs = RowRuns(kind or "direct", left, top, width, height, lengths)
             if label in mapping.lane:
                 shapes.lanes.append(runs)
-            elif kind is not None:
+                continue
+            if kind is not None:
                 shapes.areas.append(runs)
-            else:
+            if kind in {None, "ignore"}:
                 corners = (float(left), float(top), float(left + width), float(top + height))
-                objects.append(ObjectLabel(label, corners))
+                objects.append(ObjectLabel(label, corners, crowd=kind == "ignore"))
         elif shape.tag in _SHAPES:
             dropped[f"shape of kind {shape.tag!r}"] += 1
     return objects, shapes, attributes, dropped
 
 
+def _box(shape: ElementTree.Element) -> tuple[float, float, float, float]:
+    """Return a box; of a turned one, the upright box around it."""
+    x1, y1, x2, y2 = (float(shape.attrib[key]) for key in ("xtl", "ytl", "xbr", "ybr"))
+    angle = math.radians(float(shape.get("rotation") or 0))
+    if not angle:
+        return x1, y1, x2, y2
+    cos, sin = abs(math.cos(angle)), abs(math.sin(angle))
+    width, height = (x2 - x1) * cos + (y2 - y1) * sin, (x2 - x1) * sin + (y2 - y1) * cos
+    x, y = (x1 + x2) / 2, (y1 + y2) / 2
+    return x - width / 2, y - height / 2, x + width / 2, y + height / 2
+
+
 def _points(text: str) -> NDArray[np.float64]:
-    return np.array([[float(value) for value in pair.split(",")] for pair in text.split(";")], np.float64)
+    pairs = (pair.split(",") for pair in text.split(";"))
+    return np.array([(float(x), float(y)) for x, y in pairs], np.float64)

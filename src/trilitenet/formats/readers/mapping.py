@@ -8,6 +8,9 @@ import re
 from pathlib import Path
 from typing import Any, Final, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from trilitenet.config import Task, check_tasks, parse, read_yaml
 from trilitenet.data.description import VEHICLES
 from trilitenet.data.records import AreaLabel, LaneLabel, RunLabel
@@ -32,7 +35,7 @@ class MaskRule:
     values: dict[str | int, str] = dataclasses.field(default_factory=dict)
 
     def meanings(self) -> dict[int | tuple[int, int, int], str]:
-        """Return the values parsed.
+        """Return the values parsed; none = everything above 0 is foreground, as for `MaskFile`.
 
         Raises:
             ConfigError: If one is neither a level nor a colour, levels and colours are mixed, or a kind is unknown.
@@ -45,7 +48,7 @@ class MaskRule:
                 parsed[parse_colour(value)] = kind
         if len({isinstance(value, tuple) for value in parsed}) > 1:
             raise ConfigError("mask values are either all levels or all colours")
-        return parsed or dict.fromkeys(range(1, 256), "foreground")
+        return parsed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +92,11 @@ class LabelMapping:
     def __post_init__(self) -> None:
         if self.tasks:
             check_tasks(self.tasks)
+
+    def origin(self, kind: str, root: Path) -> dict[str, str]:
+        """Return what a conversion of a data set of this kind and meaning remembers; see `RecordSource`."""
+        meaning = dataclasses.replace(self, name="", licence="")  # these go to dataset.yaml alone
+        return {"kind": kind, "path": str(root.resolve()), "mapping": repr(meaning)}
 
     def area_kind(self, category: str) -> str | None:
         """Return ``direct``, ``alternative`` or ``ignore`` if a category is an area, else None."""
@@ -167,6 +175,12 @@ def read_json(path: Path) -> Any:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     except ValueError as error:
         raise DataError(f"{path}: not JSON ({error})") from error
+
+
+def hull(points: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """Return the left, top, right and bottom of (N, 2) points."""
+    (left, top), (right, bottom) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+    return left, top, right, bottom
 
 
 def find_image(name: str, folders: list[Path]) -> Path | None:

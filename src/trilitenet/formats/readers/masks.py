@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from trilitenet.config import TASKS
 from trilitenet.data.reading import IMAGE_ENDINGS
 from trilitenet.data.records import ImageRecord, ListedRecords, MaskFile
 from trilitenet.errors import DataError
@@ -27,6 +28,7 @@ def read_masks(root: str | Path, mapping: LabelMapping | None = None) -> ListedR
     root = Path(root)
     records: dict[str, list[ImageRecord]] = {}
     found = []
+    tasks = mapping.tasks or TASKS
     split_free = "{split}" not in mapping.images
     for split in (mapping.split,) if split_free else mapping.splits:
         folder = root / mapping.images.format(split=split)
@@ -36,8 +38,8 @@ def read_masks(root: str | Path, mapping: LabelMapping | None = None) -> ListedR
             ImageRecord(
                 name=path.stem,
                 image=path,
-                drivable=_mask(root, mapping.drivable_mask, split, path.stem),
-                lane=_mask(root, mapping.lane_mask, split, path.stem),
+                drivable=_mask(root, mapping.drivable_mask, split, path.stem) if "drivable" in tasks else None,
+                lane=_mask(root, mapping.lane_mask, split, path.stem) if "lane" in tasks else None,
             )
             for path in sorted(folder.iterdir())
             if path.suffix.lower() in IMAGE_ENDINGS
@@ -49,7 +51,7 @@ def read_masks(root: str | Path, mapping: LabelMapping | None = None) -> ListedR
             found.append(f"{split}: {len(items)} images, {drivable} drivable masks, {lane} lane masks")
     if not records:
         raise DataError(f"{root}: no images in {mapping.images!r} for the splits {', '.join(mapping.splits)}")
-    return ListedRecords(records, tuple(found))
+    return ListedRecords(records, tuple(found), mapping.origin("masks", root))
 
 
 def _mask(root: Path, rule: MaskRule, split: str, name: str) -> MaskFile | None:

@@ -6,19 +6,18 @@ confidence) and https://docs.ultralytics.com/datasets/segment/ (``class x1 y1 x2
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from PIL import Image, UnidentifiedImageError
 
 from trilitenet.config import Task
 from trilitenet.data.reading import IMAGE_ENDINGS
-from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ObjectLabel
+from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ObjectLabel, image_size, same_name
 from trilitenet.errors import DataError, brief
-from trilitenet.formats.readers.mapping import LabelMapping, Shapes
+from trilitenet.formats.readers.mapping import LabelMapping, Shapes, hull
 
 __all__ = ["YoloSource", "read_yolo"]
 
@@ -31,8 +30,14 @@ class YoloSource:
     """
 
     def __init__(
-        self, images: dict[str, dict[str, Path]], names: dict[int, str], mapping: LabelMapping, found: tuple[str, ...]
+        self,
+        root: Path,
+        images: dict[str, dict[str, Path]],
+        names: dict[int, str],
+        mapping: LabelMapping,
+        found: tuple[str, ...],
     ) -> None:
+        self.origin = mapping.origin("yolo", root)
         self._images = images
         self._names = names
         self._mapping = mapping
@@ -56,12 +61,9 @@ class YoloSource:
         """
         image = self._images[split][name]
         path = _label_path(image)
-        try:
-            text = path.read_text(encoding="utf-8")
-        except FileNotFoundError:
-            if self._mapping.missing == "unlabelled":
-                return ImageRecord(name, image)
-            text = ""
+        if not path.is_file() and self._mapping.missing == "unlabelled":
+            return ImageRecord(name, image)
+        text = _read_text(path) if path.is_file() else ""
         objects, shapes = self._parse(text, path, image)
         return ImageRecord(
             name=name,
@@ -75,13 +77,13 @@ class YoloSource:
         objects: list[ObjectLabel] = []
         shapes = Shapes()
         lines = [(number, line.split()) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
-        size = _size(image) if lines else (0, 0)
+        size = image_size(image) if lines else (0, 0)
         scale = np.array([size[1], size[0]], np.float64)
         for number, words in lines:
             try:
                 category = self._names.get(int(float(words[0])), words[0])
                 values = np.array([float(word) for word in words[1:]])
-            except ValueError as error:
+            except (ValueError, OverflowError) as error:
                 raise DataError(f"{path}, line {number}: not numbers ({error})") from error
             if len(values) in (4, 5):
                 centre, extent = values[:2] * scale, values[2:4] * scale
@@ -94,11 +96,11 @@ class YoloSource:
             kind = self._mapping.area_kind(category)
             if category in self._mapping.lane:
                 shapes.lanes.append(LaneLabel(category, points, closed=True))
-            elif kind is not None:
+                continue
+            if kind is not None:
                 shapes.areas.append(AreaLabel(kind, points))
-            else:
-                low, high = points.min(axis=0), points.max(axis=0)
-                objects.append(ObjectLabel(category, (float(low[0]), float(low[1]), float(high[0]), float(high[1]))))
+            if kind in {None, "ignore"}:
+                objects.append(ObjectLabel(category, hull(points), crowd=kind == "ignore"))
         return objects, shapes
 
 
@@ -114,49 +116,64 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
     """
     mapping = mapping or LabelMapping()
     path = _find_yaml(Path(root))
+    text = _read_text(path)
     try:
-        content: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content: Any = yaml.safe_load(text)
         names = content["names"]
         table = dict(enumerate(names)) if isinstance(names, list) else {int(key): value for key, value in names.items()}
         base = path.parent / str(content.get("path") or ".")
         if not base.is_dir():
             base = path.parent
-    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise DataError(f"{path}: not a YOLO data file ({brief(error)})") from error
     images: dict[str, dict[str, Path]] = defaultdict(dict)
+    missing: Counter[str] = Counter()
     for key, split in (("train", "train"), ("val", "val"), ("valid", "val"), ("test", "test")):
         places = content.get(key)
         if not places:
             continue
         for place in places if isinstance(places, list) else [places]:
             for image in _images_at(base, path.parent, str(place)):
-                images[split][image.stem] = image
+                if not image.is_file():
+                    missing[split] += 1
+                elif images[split].setdefault(image.stem, image) != image:
+                    raise same_name(image.stem, split, images[split][image.stem], image)
     if content.get("train") == content.get("val"):
         images.pop("val", None)
     images = {split: items for split, items in images.items() if items}
     if not images:
         raise DataError(f"{path}: no images in the folders that it names")
-    found = tuple(f"{split}: {len(items)} images" for split, items in images.items())
-    return YoloSource(dict(images), {key: str(value) for key, value in table.items()}, mapping, found)
+    found = [f"{split}: {len(items)} images" for split, items in images.items()]
+    found += [f"{split}: {count} listed images are not there" for split, count in missing.items()]
+    return YoloSource(path, dict(images), {key: str(value) for key, value in table.items()}, mapping, tuple(found))
 
 
 def _find_yaml(root: Path) -> Path:
     if root.is_file():
         return root
     for path in [root / "data.yaml", *sorted(root.glob("*.y*ml"))]:
-        if path.is_file() and "names" in path.read_text(encoding="utf-8"):
+        if path.is_file() and "names" in _read_text(path):
             return path
     raise DataError(f"{root}: no data.yaml with 'names'")
 
 
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: not text in UTF-8 ({brief(error)}); save it as such") from error
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+
+
 def _images_at(base: Path, beside: Path, place: str) -> list[Path]:
+    """Return the images in a folder, or those that a list names, whether they are there or not."""
     for root in (base, beside):
         folder = root / place
         if folder.is_dir():
             return sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_ENDINGS)
         if folder.suffix == ".txt" and folder.is_file():
-            lines = folder.read_text(encoding="utf-8").split()
-            return [path for path in ((root / line) for line in lines) if path.is_file()]
+            return [root / line.strip() for line in _read_text(folder).splitlines() if line.strip()]
     return []
 
 
@@ -168,11 +185,3 @@ def _label_path(image: Path) -> Path:
             parts[index] = "labels"
             break
     return Path(*parts).with_suffix(".txt")
-
-
-def _size(path: Path) -> tuple[int, int]:
-    try:
-        with Image.open(path) as image:
-            return image.height, image.width
-    except (OSError, UnidentifiedImageError) as error:
-        raise DataError(f"{path}: not an image that can be read ({error})") from error
