@@ -14,7 +14,7 @@ from PIL import Image
 import trilitenet
 from tests.artefacts import Artefacts
 from trilitenet.commands import export as command
-from trilitenet.commands.export import export
+from trilitenet.commands.export import export, find_pictures
 from trilitenet.config import TASKS
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.synthetic_files import write_dataset
@@ -22,7 +22,7 @@ from trilitenet.deploy.parity import TOLERANCES, Tolerance
 from trilitenet.engine.evaluate import evaluate
 from trilitenet.engine.figures import FIGURES
 from trilitenet.engine.report import Figure, Report
-from trilitenet.errors import BackendError, ConfigError, OutputError
+from trilitenet.errors import BackendError, ConfigError, InputError, OutputError, ShapeError
 from trilitenet.inference.onnx_backend import OnnxBackend
 from trilitenet.inference.predictor import Predictor
 from trilitenet.models.trilitenet import build_network
@@ -47,6 +47,10 @@ def test_options_that_do_not_fit(artefacts: Artefacts, tmp_path: Path) -> None:
         ({"size": "100x64"}, "multiples of 32"),
         ({"size": "big"}, "HEIGHTxWIDTH"),
         ({"format": "torch", "nms": True}, "--nms"),
+        ({"portable": True, "nms": True}, "--portable keeps to operators"),
+        ({"portable": True, "layout": "pixels"}, "--portable is planar"),
+        ({"format": "ncnn", "layout": "pixels"}, "--portable is planar"),
+        ({"format": "tensorrt", "precision": "int8"}, "tensorrt artefacts come as fp32, fp16, bf16, not int8"),
         ({"max_drop": 0.5}, "--max-drop"),
         ({"format": "ncnn", "precision": "bf16"}, "ncnn artefacts come as fp32, fp16, not bf16"),
         ({"format": "ncnn", "size": "dynamic"}, "ncnn needs a fixed --size"),
@@ -65,6 +69,27 @@ def test_options_that_do_not_fit(artefacts: Artefacts, tmp_path: Path) -> None:
     (tmp_path / "a.onnx").touch()
     with pytest.raises(OutputError, match="exists already"):
         export(weights, output=tmp_path / "a.onnx")
+
+
+def test_pictures_are_never_masks(tmp_path: Path) -> None:
+    write_dataset(tmp_path, "val", 2, 0, size=(64, 96))
+    pictures = sorted((tmp_path / "images" / "val").iterdir())
+    assert find_pictures(tmp_path, 8, "val") == pictures
+    assert find_pictures(tmp_path / "images", 8, "train") == pictures
+    with pytest.raises(InputError, match="no train split to calibrate on"):
+        find_pictures(tmp_path, 8, "train")
+    (tmp_path / "images" / "val").rename(tmp_path / "images" / "train")
+    assert [path.parent.name for path in find_pictures(tmp_path, 8, "val")] == ["train", "train"]
+
+
+def test_a_dynamic_program_says_how_small_a_side_may_be(artefacts: Artefacts, tmp_path: Path) -> None:
+    weights = str(artefacts.folder / "weights.safetensors")
+    path = export(weights, format="torch", size="dynamic", output=tmp_path / "a.pt2").path
+    program = trilitenet.load(path)
+    program.backend.run(np.zeros((1, 64, 96, 3), np.uint8))
+    for size in ((32, 96), (96, 32)):
+        with pytest.raises(ShapeError, match="takes sides from 64 pixels"):
+            program.backend.run(np.zeros((1, *size, 3), np.uint8))
 
 
 def test_suppression_needs_boxes(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ from trilitenet.engine.checkpoint import read_checkpoint
 from trilitenet.engine.loggers import CsvLogger, read_csv
 from trilitenet.engine.predictions import PredictionWriter
 from trilitenet.engine.recipe import read_recipe
+from trilitenet.engine.train import Trainer
 from trilitenet.errors import ConfigError, DataError, OutputError, TrainingError, WeightsError
 from trilitenet.models.encoder import Encoder
 from trilitenet.models.trilitenet import TriLiteNet
@@ -153,6 +154,68 @@ def test_a_signal_saves_and_ends_cleanly(
     assert signal.getsignal(number) == before
     monkeypatch.setattr(CsvLogger, "log", plain)
     assert train(resume=True, **settings(scenes, tmp_path, max_steps=6, workers=workers)).finished
+
+
+@pytest.mark.parametrize("last", [2, 4])
+def test_a_stop_in_the_last_step_of_an_epoch_loses_no_validation(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, last: int
+) -> None:
+    plain, stops = CsvLogger.log, [last]
+
+    def log(self: CsvLogger, values: Any, step: int) -> None:
+        plain(self, values, step)
+        if stops == [step]:
+            stops.clear()
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(CsvLogger, "log", log)
+    options = {"val_split": "val", "max_steps": 4, "pictures": 0}
+    assert not train(**settings(scenes, tmp_path / "parts", **options)).finished
+    parts = train(resume=True, **settings(scenes, tmp_path / "parts", **options))
+    straight = train(**settings(scenes, tmp_path / "straight", **options))
+    assert parts.finished
+    assert parts.metrics == straight.metrics
+    assert read_card(parts.weights).metrics == read_card(straight.weights).metrics
+    same(state(tmp_path / "straight"), state(tmp_path / "parts"))
+    rows = [read_csv(tmp_path / name / "metrics.csv") for name in ("straight", "parts")]
+    curves = [[row for row in part if row[1] != "images_per_second"] for part in rows]
+    assert curves[0] == curves[1]
+
+
+def test_a_kill_between_the_best_and_the_checkpoint_is_no_step_back(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = iter([0.1, 0.2, 0.2, 0.3])
+    monkeypatch.setattr("trilitenet.commands.train.validation_figures", lambda *_: {"drivable/miou": next(values)})
+    save = Trainer.save
+
+    def killed(self: Trainer) -> None:
+        if self.step == 4:
+            raise KeyboardInterrupt
+        save(self)
+
+    options = settings(scenes, tmp_path, val_split="val", tasks=("drivable",), pictures=0, patience=1, max_steps=6)
+    monkeypatch.setattr(Trainer, "save", killed)
+    with pytest.raises(KeyboardInterrupt):
+        train(**options)
+    monkeypatch.setattr(Trainer, "save", save)
+    result = train(resume=True, **options)
+    assert (result.steps, result.best["drivable"]) == (6, 0.3)
+
+
+def test_an_average_that_comes_later_begins_at_the_weights(scenes: Path, tmp_path: Path) -> None:
+    options = settings(scenes, tmp_path, max_steps=2)
+    weights = load_network(train(**options, ema_decay=0.0).weights).state_dict()
+    averaged = load_network(train(resume=True, **options, ema_decay=0.999).weights).state_dict()
+    same(dict(weights), dict(averaged))
+
+
+def test_files_of_ones_own_are_left_alone(scenes: Path, tmp_path: Path) -> None:
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "paper.csv").write_text("precious")
+    with pytest.raises(OutputError, match="files that a run would replace"):
+        train(**settings(scenes, tmp_path, max_steps=1))
+    assert (tmp_path / "results" / "paper.csv").read_text() == "precious"
 
 
 def test_validation_keeps_the_best_and_the_page(scenes: Path, tmp_path: Path) -> None:

@@ -120,9 +120,12 @@ def test_weights_of_mixed_data_sets_are_used(dataset: DrivingDataset) -> None:
 def test_what_is_left_out_is_not_mixed_in_either(dataset: DrivingDataset) -> None:
     mixed: set[str] = set()
 
-    def transform(sample: Sample, rng: np.random.Generator, other: Callable[[np.random.Generator], Sample]) -> Sample:
-        mixed.update(other(rng).name for _ in range(30))
-        return EvalTransform(CANVAS)(sample, rng, other)
+    def transform(
+        sample: Sample, rng: np.random.Generator, draw: Callable[[np.random.Generator], Sample] | None = None
+    ) -> Sample:
+        assert draw is not None
+        mixed.update(draw(rng).name for _ in range(30))
+        return EvalTransform(CANVAS)(sample, rng, draw)
 
     weights = np.ones(len(dataset))
     weights[0] = weights[-1] = 0

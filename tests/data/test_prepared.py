@@ -131,12 +131,15 @@ def describe(root: Path, text: str) -> None:
     (root / "dataset.yaml").write_text(text)
 
 
+def put_older_label(root: Path) -> None:
+    path = root / "ll_seg_annotations/train/train_0001.png"
+    cv2.imwrite(str(path), np.full((72, 128), 255, np.uint8))
+    os.utime(path, (10**9, 10**9))
+
+
 CHANGES: dict[str, Callable[[Path], object]] = {
     "a label goes": lambda root: (root / "det_annotations/train/train_0001.json").unlink(),
-    "an older label comes": lambda root: (
-        cv2.imwrite(str(root / "ll_seg_annotations/train/train_0001.png"), np.full((72, 128), 255, np.uint8)),
-        os.utime(root / "ll_seg_annotations/train/train_0001.png", (10**9, 10**9)),
-    ),
+    "an older label comes": put_older_label,
     "classes": lambda root: describe(root, "classes: {vehicle: [bus]}\nego_masks: {train_000: bonnet.png}\n"),
     "thresholds": lambda root: describe(root, "drivable: {above: 254}\nego_masks: {train_000: bonnet.png}\n"),
     "no ego mask": lambda root: describe(root, ""),

@@ -21,6 +21,16 @@ def test_csv_goes_on_without_what_came_after(tmp_path: Path) -> None:
     assert read_csv(path) == [(1, "loss", 1 / 3), (2, "loss", 2 / 3), (3, "loss", 9.0)]
 
 
+def test_a_line_that_was_cut_off_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.csv"
+    for end in ("8,val/lan", "8", "8,val/lane,0.", "8,val/lane,x\n"):
+        path.write_text(f"step,name,value\n4,loss,2.0\n{end}")
+        logger = CsvLogger(path, 7)
+        logger.log({"loss": 1.0}, 8)
+        logger.close()
+        assert read_csv(path) == [(4, "loss", 2.0), (8, "loss", 1.0)]
+
+
 def test_a_new_run_starts_the_file_anew(tmp_path: Path) -> None:
     for _ in range(2):
         logger = CsvLogger(tmp_path / "m.csv")

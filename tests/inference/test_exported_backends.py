@@ -155,6 +155,34 @@ assert caught
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
 
 
+def test_an_interruption_leaves_every_request_idle(artefacts: Artefacts) -> None:
+    interruptions = [KeyboardInterrupt()]
+
+    class Request:
+        def __init__(self, request: Any) -> None:
+            self.request = request
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self.request, name)
+
+        def wait(self) -> None:
+            if interruptions:
+                raise interruptions.pop()
+            self.request.wait()
+
+    backend = OpenVINOBackend(artefacts.folder / "model.xml", streams=2)
+    assert backend._idle is not None
+    for _ in range(2):
+        backend._idle.put(Request(backend._idle.get()))
+    images = np.concatenate([artefacts.images] * 3)
+    with pytest.raises(KeyboardInterrupt):
+        backend.run(images)
+    assert backend._idle.qsize() == 2
+    lane = backend.run(images).lane
+    assert lane is not None
+    assert len(lane) == len(images)
+
+
 def test_a_closed_model_says_so(artefacts: Artefacts) -> None:
     backend = OpenVINOBackend(artefacts.folder / "model.xml")
     backend.close()

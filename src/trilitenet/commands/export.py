@@ -68,7 +68,7 @@ PRECISIONS = {
     "onnx": ("fp32", "fp16", "int8"),
     "openvino": ("fp32", "fp16", "bf16", "int8"),
     "ncnn": ("fp32", "fp16"),
-    "tensorrt": ("fp32", "fp16", "bf16", "int8"),
+    "tensorrt": ("fp32", "fp16", "bf16"),
     "torch": ("fp32",),
     "triton": ("fp32", "fp16", "int8"),
 }
@@ -169,6 +169,8 @@ def export(
         raise ConfigError(f"{format} artefacts come as {', '.join(PRECISIONS[format])}, not {precision}")
     if nms and format not in ("onnx", "openvino", "triton"):
         raise ConfigError("--nms is for onnx, openvino and triton")
+    if nms and portable:
+        raise ConfigError("--portable keeps to operators that --nms needs more than; choose one of them")
     if precision == "int8" and calibration is None:
         raise ConfigError("int8 needs --calibration: a data set in the published layout, or a folder of road frames")
     if calibration_frames < 1:
@@ -177,6 +179,8 @@ def export(
         raise ConfigError("--max-drop is for --precision int8")
     if format in ("ncnn", "tensorrt"):
         portable = True
+    if portable and layout != "auto" and not layout.startswith("planar"):
+        raise ConfigError(f"--portable is planar, as are ncnn and tensorrt; leave --layout {layout} out")
     parsed = _parse_size(size)
     if precision == "int8" and parsed is None:
         raise ConfigError("int8 needs a fixed --size")
@@ -241,17 +245,17 @@ def export(
         bgr=bgr,
     )
     canvas = parsed or network.card.input_size
+    checks = _canvases(frames or calibration, canvas, 8)
     if format == "torch":
-        return _export_torch(network, graph, info, path, _canvases(frames, canvas, 8))
+        return _export_torch(network, graph, info, path, checks)
     if format == "ncnn":
-        return _keep(network, build_ncnn(graph, network.card, info), info, path, _canvases(frames, canvas, 8))
+        return _keep(network, build_ncnn(graph, network.card, info), info, path, checks)
     thresholds = network.card.thresholds if nms else None
     proto = build_onnx(graph, network.card, info, nms=thresholds, half=format == "onnx" and precision == "fp16")
     if format == "tensorrt":
-        return _export_tensorrt(network, proto, info, path, _canvases(frames, canvas, 8))
+        return _export_tensorrt(network, proto, info, path, checks)
 
     built: Any = build_openvino(proto) if format == "openvino" else proto
-    checks = _canvases(frames or calibration, canvas, 8)
     if precision != "int8":
         return _keep(network, built, info, path, checks)
     assert calibration is not None
@@ -341,9 +345,14 @@ def find_pictures(source: Path, count: int, split: str) -> list[Path]:
     """Return at most ``count`` pictures of a data set's split, or of a folder, spread evenly over what there is.
 
     Raises:
-        InputError: If there are none.
+        InputError: If there are none, or a data set has a val split and no train split that was asked for.
     """
-    folder = source / "images" / split if (source / "images" / split).is_dir() else source
+    images = source / "images"
+    folder = images / split
+    if not folder.is_dir():
+        if split == "train" and (images / "val").is_dir():
+            raise InputError(f"{source}: has no train split to calibrate on; give a folder of other pictures")
+        folder = images if images.is_dir() else source  # a data set's masks are no pictures
     paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _IMAGES)
     if not paths:
         raise InputError(f"{source}: no pictures there")

@@ -73,7 +73,10 @@ def train(
     folder = Path(config.output)
     checkpoint = folder / CHECKPOINT_NAME
     if holds_run(folder) and not (resume or overwrite):
-        raise OutputError(f"{folder}: holds a run already; --resume it, --overwrite it, or give another --output")
+        raise OutputError(
+            f"{folder}: holds a run already, or files that a run would replace; --resume it, --overwrite it, or give "
+            "another --output"
+        )
     if config.val_split and is_prepared(Path(config.data)):
         raise DataError(
             f"{config.data}: is prepared, and figures are measured on images as they are; give the data set that it "

@@ -27,9 +27,9 @@ def trtexec_line(onnx_path: Path, engine_path: Path, precision: str) -> str:
     Args:
         onnx_path: The ``.onnx`` file.
         engine_path: The engine to write.
-        precision: ``"fp32"``, ``"fp16"``, ``"bf16"`` or ``"int8"``.
+        precision: ``"fp32"``, ``"fp16"`` or ``"bf16"``.
     """
-    flags = {"fp32": [], "fp16": ["--fp16"], "bf16": ["--bf16"], "int8": ["--int8", "--fp16"]}[precision]
+    flags = {"fp32": [], "fp16": ["--fp16"], "bf16": ["--bf16"]}[precision]
     words = ["trtexec", f"--onnx={onnx_path}", f"--saveEngine={engine_path}", *flags, "--useCudaGraph"]
     return shlex.join(words)
 
@@ -49,12 +49,10 @@ def build_engine(model: Any, precision: str) -> bytes:  # pragma: no cover - nee
     if not parser.parse(model.SerializeToString()):
         raise BackendError(f"TensorRT refuses the graph ({parser.get_error(0)})")
     config = builder.create_builder_config()
-    if precision in ("fp16", "int8"):
+    if precision == "fp16":
         config.set_flag(tensorrt.BuilderFlag.FP16)
     if precision == "bf16":
         config.set_flag(tensorrt.BuilderFlag.BF16)
-    if precision == "int8":
-        config.set_flag(tensorrt.BuilderFlag.INT8)
     engine = builder.build_serialized_network(network, config)
     if engine is None:
         raise BackendError("TensorRT could not build an engine")

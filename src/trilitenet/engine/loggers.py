@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from trilitenet.errors import import_extra
+from trilitenet.errors import import_extra, replacing
 
 __all__ = ["CsvLogger", "MLflowLogger", "RunLogger", "TensorBoardLogger", "WandbLogger", "build_loggers"]
 
@@ -33,10 +34,12 @@ class CsvLogger:
     def __init__(self, path: Path, step: int = 0) -> None:
         rows = read_csv(path) if step and path.exists() else []
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = path.open("w", newline="", encoding="utf-8")
+        with replacing(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(("step", "name", "value"))
+            writer.writerows(row for row in rows if row[0] <= step)
+        self._file = path.open("a", newline="", encoding="utf-8")
         self._writer = csv.writer(self._file)
-        self._writer.writerow(("step", "name", "value"))
-        self._writer.writerows(row for row in rows if row[0] <= step)
 
     def log(self, values: Mapping[str, float], step: int) -> None:
         """Take named figures of a step."""
@@ -49,9 +52,13 @@ class CsvLogger:
 
 
 def read_csv(path: Path) -> list[tuple[int, str, float]]:
-    """Return the (step, name, value) rows that `CsvLogger` wrote."""
-    with path.open(newline="", encoding="utf-8") as file:
-        return [(int(row["step"]), row["name"], float(row["value"])) for row in csv.DictReader(file)]
+    """Return the (step, name, value) rows that `CsvLogger` wrote, without a line that a full disk or a kill cut off."""
+    rows: list[tuple[int, str, float]] = []
+    with path.open(newline="", encoding="utf-8", errors="replace") as file:
+        for row in csv.DictReader(file):
+            with contextlib.suppress(TypeError, ValueError, KeyError):
+                rows.append((int(row["step"]), row["name"], float(row["value"])))
+    return rows
 
 
 class TensorBoardLogger:

@@ -180,6 +180,9 @@ class Trainer:
         self.best: dict[str, float] = {}
         self.metrics: dict[str, float] = {}
         self.stale = 0
+        self.ended = 0
+        """Step at which an epoch was last validated and saved, for a stop comes between it and its last step."""
+        self._ahead: dict[str, tuple[float, int]] = {}
         self.seconds = 0.0
         self.images = 0
 
@@ -222,6 +225,8 @@ class Trainer:
     def _run(self) -> bool:
         """Run the epochs; return whether the end was reached, by schedule or by early stopping."""
         with StopRequest() as stop:
+            if self.ended < self.step and (self.step % self.epoch_steps == 0 or self.step >= self.steps):
+                self._end_epoch((self.step - 1) // self.epoch_steps)
             while self.step < self.steps and not self._stopped(stop) and not self._stalled():
                 epoch, start = divmod(self.step, self.epoch_steps)
                 self._train_epoch(epoch, start, stop)
@@ -314,6 +319,7 @@ class Trainer:
                 self._show(f"epoch {epoch + 1}/{self.config.epochs}: {figures}")
                 self._keep_best()
             self.stale = self.fabric.broadcast(self.stale)
+        self.ended = self.step
         if last or (epoch + 1) % self.config.checkpoint_every == 0:
             self.save()
 
@@ -325,7 +331,8 @@ class Trainer:
             scores["overall"] = sum(scores.values()) / len(scores)
         self.stale += 1
         for name, value in scores.items():
-            if value > self.best.get(name, -math.inf):
+            # A file that is newer than the checkpoint is made again by the steps that are run again.
+            if value > self.best.get(name, -math.inf) or self._ahead.get(name) == (value, self.step):
                 self.best[name] = value
                 card = self._card()
                 card = dataclasses.replace(card, metrics={**card.metrics, f"best {name}": value})
@@ -390,6 +397,7 @@ class Trainer:
                 "best": self.best,
                 "metrics": self.metrics,
                 "stale": self.stale,
+                "ended": self.ended,
                 "random": random_state(),
             },
         )
@@ -421,13 +429,15 @@ class Trainer:
         self.network.load_state_dict(state["network"])
         if self.loss.detection is not None:
             self.loss.detection.anchors.copy_(self.network.anchors)
-        if self.ema is not None and state["ema"] is not None:
-            self.ema.load_state_dict(state["ema"])
+        if self.ema is not None:
+            # A run without an average that goes on with one: it begins at the weights as they are.
+            self.ema.load_state_dict(state["ema"] or {"updates": 0, "network": state["network"]})
         self.optimiser.load_state_dict(state["optimiser"])
         self.loss.load_state_dict(state["loss"])
         if state.get("scaler"):
             self.fabric._precision.load_state_dict(state["scaler"])
         self.step, self.stale = int(state["step"]), int(state.get("stale", 0))
+        self.ended = int(state.get("ended", self.step))
         self.best, self.metrics = dict(state["best"]), dict(state["metrics"])
         set_random_state(state["random"])
 
@@ -435,9 +445,13 @@ class Trainer:
         """Learn from files newer than the checkpoint what is to be beaten."""
         for name in (*self.network.tasks, "overall"):
             path = self._best_path(name)
-            value = read_card(path).metrics.get(f"best {name}", -math.inf) if path.is_file() else -math.inf
+            if not path.is_file():
+                continue
+            card = read_card(path)
+            value = card.metrics.get(f"best {name}", -math.inf)
             if value > self.best.get(name, -math.inf):
                 self.best[name] = value
+                self._ahead[name] = value, int(card.provenance.get("steps", 0))
 
     def _scaler_state(self) -> dict[str, Any]:
         state: dict[str, Any] = self.fabric._precision.state_dict()
@@ -445,8 +459,8 @@ class Trainer:
 
 
 def holds_run(folder: Path) -> bool:
-    """Return whether a folder has a run's state or weights, which a new run would replace."""
-    return any(True for pattern in _RESULTS for _ in folder.glob(pattern))
+    """Return whether a folder has anything that a new run would replace."""
+    return any(True for pattern in (*_RESULTS, *_TRACES) for _ in folder.glob(pattern))
 
 
 def _forget(folder: Path) -> None:

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ModelCard
-from trilitenet.errors import WeightsError
+from trilitenet.errors import ShapeError, WeightsError
 from trilitenet.inference.exported import prepare_input, read_metadata, run_images
 from trilitenet.inference.torch_backend import pick_device
 from trilitenet.structures import RawOutputs
@@ -61,7 +61,12 @@ class ExportedTorchBackend:
         return self.info.size
 
     def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
-        """Run the network on (B, H, W, 3) uint8 RGB; see `Backend.run`."""
+        """Run the network on (B, H, W, 3) uint8 RGB, if it is dynamic from 64 pixels on; see `Backend.run`."""
+        if self.info.size is None and batch.ndim == 4 and min(batch.shape[1:3]) < 64:
+            raise ShapeError(
+                f"a dynamic .pt2 takes sides from 64 pixels, got {batch.shape[2]}x{batch.shape[1]}: use the weights, "
+                "or export it with a fixed --size"
+            )
 
         def outputs() -> list[Mapping[str, NDArray[Any]]]:
             with torch.no_grad():

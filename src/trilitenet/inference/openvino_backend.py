@@ -151,13 +151,14 @@ class OpenVINOBackend:
             results: list[Mapping[str, NDArray[Any]]] = []
             inputs = collections.deque(prepare_input(image, self.info) for image in batch)
             while inputs:
-                busy = [idle.get()]
-                while len(busy) < len(inputs) and not idle.empty():
-                    try:
-                        busy.append(idle.get_nowait())
-                    except queue.Empty:  # another thread was quicker
-                        break
+                busy: list[Any] = []
                 try:
+                    busy.append(idle.get())
+                    while len(busy) < len(inputs) and not idle.empty():
+                        try:
+                            busy.append(idle.get_nowait())
+                        except queue.Empty:  # another thread was quicker
+                            break
                     for request in busy:
                         request.start_async([inputs.popleft()], share_inputs=True)
                     for request in busy:
@@ -168,6 +169,8 @@ class OpenVINOBackend:
                         )
                 finally:
                     for request in busy:
+                        with contextlib.suppress(RuntimeError):
+                            request.wait()  # Ctrl-C may have left it running
                         idle.put(request)
             return results
 

@@ -437,7 +437,7 @@ def find_sources(
         try:
             sources.append(make())
         except InputError as error:
-            failures.append(Failure(name, str(error)))
+            failures.append(Failure(_without_secrets(name), str(error)))
 
     taken: set[Path] = set()
     for name in dict.fromkeys(map(str, names)):

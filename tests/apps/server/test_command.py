@@ -55,7 +55,7 @@ def test_the_token_comes_from_a_file_or_the_environment(
     file = tmp_path / "token"
     file.write_text(f"{TOKEN}\n")
     command.serve(port=0, token_file=file)
-    monkeypatch.setenv("TRILITENET_TOKEN", TOKEN[::-1])
+    monkeypatch.setenv("TRILITENET_TOKEN", f"{TOKEN[::-1]}\n")
     command.serve(port=0)
     assert [_settings(server).token for server in started] == [TOKEN, TOKEN[::-1]]
     assert TOKEN not in repr(_settings(started[0]))
@@ -64,12 +64,18 @@ def test_the_token_comes_from_a_file_or_the_environment(
 def test_mistakes_are_told_in_one_line(started: list[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     short = tmp_path / "short"
     short.write_text("secret")
+    binary = tmp_path / "binary"
+    binary.write_bytes(bytes(range(128, 256)))
+    foreign = tmp_path / "foreign"
+    foreign.write_text("schlüssel" * 4, encoding="utf-8")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         for words, message in (
             (["--log-level", "loud"], "log_level must be debug"),
             (["--token-file", str(tmp_path / "none")], "cannot be read"),
             (["--token-file", str(short)], "at least 16 characters"),
+            (["--token-file", str(binary)], "holds no token (it is not text)"),
+            (["--token-file", str(foreign)], "must be plain ASCII"),
             (["--queue", "0"], "queue must be at least 1"),
             (["--deadline", "-1"], "deadline must be positive"),
             (["--port", port], f"cannot listen on 127.0.0.1 port {port} (Address already in use); choose"),

@@ -91,6 +91,7 @@ def test_plain_json_works(client: TestClient) -> None:
         (_tensor(datatype="BYTES", shape=[1], data=["%%%"]), 400, "base64"),
         (_tensor(datatype="BYTES", shape=[1], data=["aGVsbG8="]), 415, "not a JPEG"),
         (_tensor(parameters={"binary_data_size": 3}), 400, "3, 0 bytes came"),
+        (_tensor(parameters={"binary_data_size": "\ud800"}), 400, "'\\ud800', 0 bytes came"),
         ({**_tensor(), "outputs": [{"name": "x"}]}, 400, "unknown output 'x'"),
         ({**_tensor(), "outputs": [{"name": "boxes", "parameters": 5}]}, 400, "must be an object"),
         ({**_tensor(), "id": 3}, 400, "id must be"),

@@ -10,8 +10,10 @@ from PIL import Image
 from starlette.testclient import TestClient
 
 from tests.apps.server.conftest import FakeBackend, MakeApp, encode, picture
-from trilitenet.apps.server.application import Application
+from trilitenet.apps.server.application import Application, create_app
 from trilitenet.apps.server.openapi import BatchPrediction, Prediction
+from trilitenet.config import ArtefactInfo
+from trilitenet.inference.predictor import Predictor
 from trilitenet.structures import Perception
 
 
@@ -57,6 +59,17 @@ def test_confidence_replaces_the_threshold(client: TestClient, jpeg: bytes) -> N
         return len(client.post(f"/v1/predict{query}", content=jpeg).json()["perception"]["boxes"])
 
     assert [count(""), count("?confidence=0.05"), count("?confidence=0.6")] == [2, 3, 1]
+
+
+def test_a_confidence_that_the_artefact_cannot_give_is_refused(backend: FakeBackend, jpeg: bytes) -> None:
+    backend.info = ArtefactInfo("onnx", nms=True)  # type: ignore[attr-defined]
+    least = backend.card.thresholds.confidence
+    with TestClient(create_app(Predictor(backend), "tiny")) as client:
+        assert client.get("/v1/models").json()["models"][0]["least_confidence"] == least
+        assert client.post(f"/v1/predict?confidence={least}", content=jpeg).status_code == 200
+        answer = client.post("/v1/predict?confidence=0.01", content=jpeg)
+    assert answer.status_code == 422
+    assert answer.json()["error"]["code"] == "confidence_too_low"
 
 
 def test_overlay_is_the_picture_with_everything_drawn(client: TestClient, app: Application) -> None:
@@ -145,6 +158,7 @@ def test_models_shows_the_card(client: TestClient) -> None:
     assert model["name"] == "tiny"
     assert model["backend"] == "fake"
     assert model["card"]["licence"] == "MIT"
+    assert (model["least_confidence"], model["max_images"]) == (0.0, 16)
 
 
 def test_probes_follow_the_life_of_the_service(app: Application) -> None:

@@ -112,8 +112,10 @@ def _listen(host: str, port: int) -> socket.socket:
 def _read_token(file: Path | None) -> str | None:
     """Return the bearer token. It is not taken from the command line, where other users could read it."""
     if file is None:
-        return os.environ.get("TRILITENET_TOKEN") or None
+        return os.environ.get("TRILITENET_TOKEN", "").strip() or None
     try:
         return file.read_text(encoding="utf-8").strip()
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror or error})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file}: holds no token (it is not text)") from error

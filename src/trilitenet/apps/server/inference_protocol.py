@@ -200,7 +200,7 @@ def _binary(tensor: dict[str, Any], rest: bytes) -> bytes | None:
     if size is None:
         return None
     if size != len(rest):
-        raise _bad(f"binary_data_size is {str(size)[:40]}, {len(rest)} bytes came")
+        raise _bad(f"binary_data_size is {size!r:.40}, {len(rest)} bytes came")
     return rest
 
 

@@ -207,7 +207,8 @@ PREDICT_BATCH: Final[dict[str, Any]] = {
 MODELS: Final[dict[str, Any]] = {
     "responses": {
         200: {
-            "description": "The model card: variant, classes, thresholds, training data, figures, licence.",
+            "description": "The model card: variant, classes, thresholds, training data, figures, licence; the least "
+            "confidence that may be asked for, and images of one batch request.",
             "content": {
                 "application/json": {
                     "example": {
@@ -217,6 +218,8 @@ MODELS: Final[dict[str, Any]] = {
                                 "name": "small",
                                 "backend": "openvino cpu",
                                 "ready": True,
+                                "least_confidence": 0.0,
+                                "max_images": 16,
                                 "card": {"variant": "small", "class_names": ["vehicle"]},
                             }
                         ],

@@ -81,7 +81,14 @@ def rest_router(service: Service) -> APIRouter:
     async def models() -> Response:
         """Say which model is served, what it was trained on and how it may be used."""
         card = dataclasses.asdict(service.card)
-        model = {"name": service.name, "backend": service.predictor.backend.name, "ready": service.ready, "card": card}
+        model = {
+            "name": service.name,
+            "backend": service.predictor.backend.name,
+            "ready": service.ready,
+            "least_confidence": service.least_confidence,
+            "max_images": service.settings.max_images,
+            "card": card,
+        }
         return JSONResponse({"version": __version__, "models": [model]})
 
     @router.get("/healthz", tags=["operation"], **openapi.PROBE)

@@ -26,8 +26,9 @@ from trilitenet import __version__
 from trilitenet.apps.server.batching import Admission, Batcher
 from trilitenet.apps.server.intake import Header, MemoryBudget, decode
 from trilitenet.apps.server.metrics import Metrics
-from trilitenet.apps.server.problems import BusyError
+from trilitenet.apps.server.problems import BusyError, ProblemError
 from trilitenet.apps.server.settings import Settings
+from trilitenet.config import ArtefactInfo
 from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.structures import Perception, RawOutputs
@@ -75,6 +76,9 @@ class Service:
 
     def __init__(self, predictor: Predictor, name: str, settings: Settings) -> None:
         self.predictor = predictor
+        info: ArtefactInfo | None = getattr(predictor.backend, "info", None)
+        self.least_confidence = predictor.card.thresholds.confidence if info is not None and info.nms else 0.0
+        """An artefact that suppresses boxes inside has none below."""
         self.name = name
         self.settings = settings
         self.card = predictor.card
@@ -167,6 +171,12 @@ class Service:
             ProblemError: If the image is broken.
         """
         predictor = self.predictor
+        if confidence is not None and confidence < self.least_confidence:
+            raise ProblemError(
+                422,
+                "confidence_too_low",
+                f"this model drops boxes below {self.least_confidence:g} itself; ask for that or more",
+            )
         if confidence is not None:
             thresholds = dataclasses.replace(predictor.thresholds, confidence=confidence)
             predictor = Predictor(predictor.backend, thresholds, long_side=predictor.long_side)

@@ -68,6 +68,8 @@ class Settings:
             raise ConfigError(f"max_images ({self.max_images}) must not exceed queue ({self.queue})")
         if self.token is not None and len(self.token) < 16:
             raise ConfigError("the token must have at least 16 characters; make one with: openssl rand -hex 32")
+        if self.token is not None and not (self.token.isascii() and self.token.isprintable() and " " not in self.token):
+            raise ConfigError("the token must be plain ASCII without spaces; make one with: openssl rand -hex 32")
 
     @property
     def thread_count(self) -> int:

@@ -5,8 +5,6 @@ import { drawFrame, prepare, shownBoxes } from "./draw.js";
 import { openCamera, openClip, openPhoto } from "./sources.js";
 
 const LAYERS = ["detection", "drivable", "lane"];
-const FLOOR = 0.05; // boxes below are not even asked for
-const CHUNK = 8; // frames of a clip in one request
 const STAGES = ["decode", "preprocess", "queue", "network", "postprocess"];
 
 const element = (id) => document.getElementById(id);
@@ -14,6 +12,8 @@ const view = element("view");
 const options = Object.fromEntries(LAYERS.map((name) => [name, { show: true, opacity: 1 }]));
 options.confidence = 0.25;
 
+let floor = 0.05; // boxes below are not even asked for
+let chunkSize = 8; // frames of a clip in one request
 let frames = []; // { blob, result, picture?, time? }: pictures of a clip are decoded again when they are shown
 let current = null; // the prepared frame on the canvas
 let position = 0;
@@ -162,7 +162,7 @@ async function seePhoto(file, name, signal) {
   element("summary").textContent = "Looking …";
   document.body.setAttribute("aria-busy", "true");
   const { blob, picture } = await openPhoto(file);
-  const result = await predict(blob, FLOOR, signal);
+  const result = await predict(blob, floor, signal);
   frames = [{ blob, result, picture: picture ?? (await createImageBitmap(blob)) }];
   fileName = name;
   showPlayer();
@@ -179,8 +179,8 @@ async function seeClip(file, name, signal) {
   let chunk = [];
   for await (const frame of openClip(file, wanted, signal)) {
     chunk.push(frame);
-    if (chunk.length < CHUNK && frame.index < frame.count - 1) continue;
-    const results = await predictBatch(chunk.map((one) => one.blob), FLOOR, signal);
+    if (chunk.length < chunkSize && frame.index < frame.count - 1) continue;
+    const results = await predictBatch(chunk.map((one) => one.blob), floor, signal);
     for (const [index, one] of chunk.entries()) {
       one.picture.close();
       seen.push({ blob: one.blob, time: one.time, result: results[index] });
@@ -199,7 +199,7 @@ async function seeClip(file, name, signal) {
 
 async function seeCamera(signal) {
   for await (const { blob, picture } of openCamera(signal)) {
-    const result = await predict(blob, FLOOR, signal);
+    const result = await predict(blob, floor, signal);
     frames[0]?.picture?.close?.();
     frames = [{ blob, result, picture }];
     fileName = "camera";
@@ -315,6 +315,9 @@ run(async () => {
   const model = await getModel();
   if (model.card.tasks.length < 3) element("tasks").textContent = model.card.tasks.join(", ");
   element("model").textContent = `model ${model.name} on ${model.backend}`;
+  floor = Math.max(floor, model.least_confidence);
+  chunkSize = Math.min(chunkSize, model.max_images);
+  element("confidence").min = floor;
   element("confidence").value = model.card.thresholds.confidence;
   readControls();
 });
