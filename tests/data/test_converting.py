@@ -300,6 +300,7 @@ NAN = float("nan")
         ("a.png", {"drivable": (RowRuns("direct", 0, 0, 4, 2, (4, -1, 5)),)}, "negative"),
         ("a.png", {"drivable": (CocoRuns("direct", (6, 8), "zz!!zz"),)}, "run-length"),
     ],
+    ids=["kind", "name", "attribute", "size", "area", "line", "edges", "row runs", "runs"],
 )
 def test_what_cannot_be_used_is_left_out(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str, more: dict[str, Any], message: str

@@ -320,7 +320,8 @@ class _Job:
                 return earlier
             summary = {**_convert_one(record, self.split, self.root, self.options), "digest": digest}
         except DataError as error:
-            _logger.warning("left out %s/%s: %s", self.split, name, error)
+            readable = name.encode("utf-8", "backslashreplace").decode()  # a file's name may be no text
+            _logger.warning("left out %s/%s: %s", self.split, readable, error)
             summary = {"name": name, "dropped": {"image: labels or image broken": 1}, "error": str(error)}
         _remove_files(self.root, self.split, name, keep=_files(self.split, summary))
         return summary
