@@ -92,6 +92,11 @@ def same(first: Any, second: Any, path: str = "") -> None:
         assert first == second, path
 
 
+def curves(folder: Path) -> list[tuple[int, str, float]]:
+    """Return a run's figures but its speed."""
+    return [row for row in read_csv(folder / "metrics.csv") if row[1] != "images_per_second"]
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")  # two workers on a machine of one core
 def test_resume_is_bit_for_bit(scenes: Path, tmp_path: Path) -> None:
@@ -101,9 +106,7 @@ def test_resume_is_bit_for_bit(scenes: Path, tmp_path: Path) -> None:
         result = train(resume=steps > 9, **settings(scenes, tmp_path / "parts", max_steps=steps, **options))
         assert result.steps == steps
     same(state(tmp_path / "straight"), state(tmp_path / "parts"))
-    rows = [read_csv(tmp_path / name / "metrics.csv") for name in ("straight", "parts")]
-    curves = [[row for row in part if row[1] != "images_per_second"] for part in rows]
-    assert curves[0] == curves[1]
+    assert curves(tmp_path / "straight") == curves(tmp_path / "parts")
 
 
 def test_pixels_reach_the_network_unrounded_in_bf16(
@@ -177,9 +180,7 @@ def test_a_stop_in_the_last_step_of_an_epoch_loses_no_validation(
     assert parts.metrics == straight.metrics
     assert read_card(parts.weights).metrics == read_card(straight.weights).metrics
     same(state(tmp_path / "straight"), state(tmp_path / "parts"))
-    rows = [read_csv(tmp_path / name / "metrics.csv") for name in ("straight", "parts")]
-    curves = [[row for row in part if row[1] != "images_per_second"] for part in rows]
-    assert curves[0] == curves[1]
+    assert curves(tmp_path / "straight") == curves(tmp_path / "parts")
 
 
 def test_a_kill_between_the_best_and_the_checkpoint_is_no_step_back(

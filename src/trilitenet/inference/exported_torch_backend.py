@@ -62,13 +62,14 @@ class ExportedTorchBackend:
 
     def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
         """Run the network on (B, H, W, 3) uint8 RGB, if it is dynamic from 64 pixels on; see `Backend.run`."""
-        if self.info.size is None and batch.ndim == 4 and min(batch.shape[1:3]) < 64:
-            raise ShapeError(
-                f"a dynamic .pt2 takes sides from 64 pixels, got {batch.shape[2]}x{batch.shape[1]}: use the weights, "
-                "or export it with a fixed --size"
-            )
 
         def outputs() -> list[Mapping[str, NDArray[Any]]]:
+            height, width = batch.shape[1:3]
+            if self.info.size is None and min(height, width) < 64:
+                raise ShapeError(
+                    f"a dynamic .pt2 takes sides from 64 pixels, got {width}x{height}: use the weights, or export it "
+                    "with a fixed --size"
+                )
             with torch.no_grad():
                 return [
                     {

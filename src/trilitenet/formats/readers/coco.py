@@ -60,15 +60,13 @@ def _annotation_files(root: Path, default: str) -> tuple[list[tuple[Path, str]],
     files = sorted({*root.glob("*.json"), *root.glob("annotations/*.json"), *root.glob("*/_annotations.coco.json")})
     splits = {path: _split_of(path, default) for path in files if _is_coco(path)}
     whole = {split for path, split in splits.items() if path.name.startswith("instances_")}
-    chosen = [
-        (path, split) for path, split in splits.items() if path.name.startswith("instances_") or split not in whole
-    ]
+    chosen = {path: split for path, split in splits.items() if path.name.startswith("instances_") or split not in whole}
     if not chosen:
         raise DataError(
             f"{root}: no COCO annotations; looked for *.json, annotations/*.json and */_annotations.coco.json with "
             "the keys 'images' and 'annotations', and a 'category_id' in these"
         )
-    return chosen, [path for path in files if path not in dict(chosen)]
+    return [*chosen.items()], [path for path in files if path not in chosen]
 
 
 def _is_coco(path: Path) -> bool:

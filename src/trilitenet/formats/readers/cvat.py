@@ -120,13 +120,12 @@ def _read_image(
             objects.append(ObjectLabel(label, _box(shape), crowd, more))
         elif shape.tag in {"polygon", "polyline"}:
             points = _points(shape.attrib["points"])
+            closed = shape.tag == "polygon"
             if label in mapping.lane:
-                closed = shape.tag == "polygon"
                 shapes.lanes.append(LaneLabel(label, points, closed=closed, edge=mapping.lane_edges and not closed))
-                continue
-            if kind is not None and shape.tag == "polygon":
-                shapes.areas.append(AreaLabel(kind, points))
-            if kind in {None, "ignore"} or shape.tag == "polyline":
+            elif closed:
+                objects += shapes.add(AreaLabel(kind or "direct", points), ObjectLabel(label, hull(points)), kind)
+            else:
                 objects.append(ObjectLabel(label, hull(points), crowd=kind == "ignore"))
         elif shape.tag == "mask":
             left, top, width, height = (int(shape.attrib[key]) for key in ("left", "top", "width", "height"))
@@ -134,12 +133,9 @@ def _read_image(
             runs = RowRuns(kind or "direct", left, top, width, height, lengths)
             if label in mapping.lane:
                 shapes.lanes.append(runs)
-                continue
-            if kind is not None:
-                shapes.areas.append(runs)
-            if kind in {None, "ignore"}:
+            else:
                 corners = (float(left), float(top), float(left + width), float(top + height))
-                objects.append(ObjectLabel(label, corners, crowd=kind == "ignore"))
+                objects += shapes.add(runs, ObjectLabel(label, corners), kind)
         elif shape.tag in _SHAPES:
             dropped[f"shape of kind {shape.tag!r}"] += 1
     return objects, shapes, attributes, dropped

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import Task, check_tasks, parse, read_yaml
 from trilitenet.data.description import VEHICLES
-from trilitenet.data.records import AreaLabel, LaneLabel, RunLabel
+from trilitenet.data.records import AreaLabel, LaneLabel, ObjectLabel, RunLabel
 from trilitenet.errors import ConfigError, DataError
 
 __all__ = ["LabelMapping", "MaskRule", "parse_colour", "read_mapping"]
@@ -126,6 +126,18 @@ class Shapes:
 
     areas: list[AreaLabel | RunLabel] = dataclasses.field(default_factory=list)
     lanes: list[LaneLabel | RunLabel] = dataclasses.field(default_factory=list)
+
+    def add(self, region: AreaLabel | RunLabel, label: ObjectLabel, kind: str | None) -> list[ObjectLabel]:
+        """Take a region that is no marking; return it as an object too, unless it is an area alone.
+
+        Args:
+            region: As an area.
+            label: As an object.
+            kind: What `LabelMapping.area_kind` says of its category; what is to be ignored is both.
+        """
+        if kind is not None:
+            self.areas.append(region)
+        return [dataclasses.replace(label, crowd=kind == "ignore")] if kind in {None, "ignore"} else []
 
 
 def read_mapping(path: str | Path | None) -> LabelMapping:

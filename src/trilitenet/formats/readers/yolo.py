@@ -96,11 +96,8 @@ class YoloSource:
             kind = self._mapping.area_kind(category)
             if category in self._mapping.lane:
                 shapes.lanes.append(LaneLabel(category, points, closed=True))
-                continue
-            if kind is not None:
-                shapes.areas.append(AreaLabel(kind, points))
-            if kind in {None, "ignore"}:
-                objects.append(ObjectLabel(category, hull(points), crowd=kind == "ignore"))
+            else:
+                objects += shapes.add(AreaLabel(kind or "direct", points), ObjectLabel(category, hull(points)), kind)
         return objects, shapes
 
 
