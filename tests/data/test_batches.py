@@ -56,6 +56,18 @@ def test_ego_mask_is_ignored_by_every_task() -> None:
     assert (covered & ~valid).sum() > 0.8 * (~valid).sum()
 
 
+def test_what_one_mask_ignores_counts_for_the_other_and_for_boxes() -> None:
+    ones, valid = np.ones((32, 64), np.uint8), np.ones((32, 64), np.bool_)
+    valid[:16] = False
+    batch = collate([sample("a", drivable=ones, lane=ones, drivable_valid=valid)])
+    assert (batch.drivable[0].numpy() == NOT_LABELLED).tolist() == (~valid).tolist()
+    assert set(batch.lane[0].flatten().tolist()) == {1}
+    assert not len(batch.ignored)
+    batch = collate([sample("a", drivable=ones, lane=ones, lane_valid=valid, valid=valid[::-1])])
+    assert (batch.drivable[0].numpy() == NOT_LABELLED).tolist() == (~valid[::-1]).tolist()
+    assert set(batch.lane[0].flatten().tolist()) == {NOT_LABELLED}
+
+
 def test_what_lies_between_ignored_areas_is_not_ignored() -> None:
     valid = np.ones((32, 64), np.bool_)
     valid[:4] = valid[28:] = False

@@ -15,6 +15,7 @@ from tests.data.published import write_published
 from trilitenet.data.loader import build_loader
 from trilitenet.data.prepared import PreparedDataset, open_dataset, prepare
 from trilitenet.data.reading import DrivingDataset
+from trilitenet.data.sample import VALID
 from trilitenet.data.transforms import TrainTransform
 from trilitenet.errors import ConfigError, DataError, OutputError
 
@@ -29,7 +30,14 @@ def root(tmp_path: Path) -> Path:
     mask = np.zeros((72, 128), np.uint8)
     mask[60:] = 255
     cv2.imwrite(str(root / "bonnet.png"), mask)
-    (root / "dataset.yaml").write_text("ego_masks: {train_000: bonnet.png}\n")
+    for folder, name in (("da_seg_annotations", "train_0001"), ("ll_seg_annotations", "train_0002")):
+        path = root / folder / "train" / f"{name}.png"
+        labels = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+        labels[20:40, :50] = 64
+        cv2.imwrite(str(path), labels)
+    (root / "dataset.yaml").write_text(
+        "ego_masks: {train_000: bonnet.png}\ndrivable: {ignore: [64]}\nlane: {ignore: [64]}\n"
+    )
     return root
 
 
@@ -60,7 +68,7 @@ def test_attributes_tasks_and_missing_labels(root: Path, tmp_path: Path) -> None
     for index in range(len(raw)):
         assert packed.attributes(index) == raw.attributes(index)
         one, two = raw[index], packed[index]
-        for field in ("boxes", "class_id", "drivable", "lane", "valid"):
+        for field in ("boxes", "class_id", "drivable", "lane", *VALID):
             assert (getattr(one, field) is None) == (getattr(two, field) is None), field
     lanes = PreparedDataset(tmp_path / "out", "train", tasks=["lane"])[0]
     assert lanes.boxes is None

@@ -120,8 +120,10 @@ def test_mask_values_have_a_meaning(root: Path) -> None:
     sample = DrivingDataset(root, "train")[0]
     assert sample.drivable is not None
     assert sample.drivable[:4, 0].tolist() == [1, 1, 0, 1]
-    assert sample.valid is not None
-    assert np.flatnonzero(~sample.valid.all(axis=1)).tolist() == [2]
+    assert sample.valid is None
+    assert sample.lane_valid is None
+    assert sample.drivable_valid is not None
+    assert np.flatnonzero(~sample.drivable_valid.all(axis=1)).tolist() == [2]
     assert sample.boxes is None
     assert sample.lane is None
 

@@ -41,7 +41,9 @@ def marked(size: tuple[int, int] = (360, 640), at: tuple[float, float] = (0.5, 0
     mask = np.zeros(size, np.uint8)
     mask[area] = 1
     box = np.array([[cx - half, cy - half, cx + half, cy + half]], np.float32)
-    return Sample("marked", image, box, np.array([0]), box.copy(), mask, mask.copy(), mask == 0, {"a": "b"})
+    valid = mask == 0
+    masks = (mask, mask.copy(), valid, valid.copy(), valid.copy())
+    return Sample("marked", image, box, np.array([0]), box.copy(), *masks, {"a": "b"})
 
 
 def bounds(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -63,6 +65,8 @@ def check_together(sample: Sample, tolerance: float = 2.0) -> bool:
     assert sample.lane is not None
     assert sample.valid is not None
     np.testing.assert_array_equal(sample.drivable, sample.lane)
+    np.testing.assert_array_equal(sample.valid, sample.drivable_valid)
+    np.testing.assert_array_equal(sample.valid, sample.lane_valid)
     assert not (sample.valid & (sample.drivable > 0)).any()
     assert not (~sample.valid & ~cv2.dilate(sample.drivable, np.ones((5, 5))).astype(bool)).any()
     visible = seen(sample.image)

@@ -192,3 +192,28 @@ def test_tasks_that_are_not_asked_for_are_not_scored() -> None:
     assert scores.detection is None
     assert scores.drivable is None
     assert all(name.startswith("lane/") for name in metrics.figures())
+
+
+def test_a_mask_that_ignores_pixels_leaves_the_other_alone() -> None:
+    image = np.zeros((2, 3, 3), np.uint8)
+    ignored = mask("110 000") == 0
+    labelled = Sample("a", image, drivable=mask("001 000"), lane=mask("100 000"), drivable_valid=ignored)
+    metrics = FairMetrics(("vehicle",), ("drivable", "lane"))
+    metrics.update(
+        labelled, Perception((2, 3), ("vehicle",), None, mask("111 000").astype(bool), mask("000 000").astype(bool))
+    )
+    scores = metrics.compute()
+    assert scores.drivable is not None
+    assert scores.lane is not None
+    assert scores.drivable.iou == 1
+    assert scores.lane.as_labelled.iou == 0
+
+
+def test_boxes_on_the_own_car_are_not_wrong() -> None:
+    valid = np.ones((40, 40), np.bool_)
+    valid[30:] = False
+    labelled = Sample("a", np.zeros((40, 40, 3), np.uint8), truth((0, 0, 10, 10)), np.zeros(1, np.int64), valid=valid)
+    found = boxes((0, 0, 10, 10, 0.6), (5, 26, 35, 40, 0.9), (5, 12, 35, 40, 0.8))
+    metrics = FairMetrics(("vehicle",), ("detection",))
+    outcome = metrics.update(labelled, Perception((40, 40), ("vehicle",), found, None, None))
+    assert (outcome.right, outcome.wrong, outcome.missed) == (1, 1, 0)  # 10 of 14 and 10 of 28 rows on the bonnet

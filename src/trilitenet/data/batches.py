@@ -83,11 +83,14 @@ def collate(samples: Sequence[Sample]) -> Batch:
     ignored: list[NDArray[np.float32]] = [np.zeros((0, 5), np.float32)]
     for index, sample in enumerate(samples):
         cv2.split(sample.image, list(images[index]))
-        for target, mask in ((drivable, sample.drivable), (lane, sample.lane)):
+        for target, mask, counted in (
+            (drivable, sample.drivable, sample.counted("drivable")),
+            (lane, sample.lane, sample.counted("lane")),
+        ):
             if mask is not None:
                 target[index] = mask
-                if sample.valid is not None:
-                    target[index][~sample.valid] = NOT_LABELLED
+                if counted is not None:
+                    target[index][~counted] = NOT_LABELLED
         if sample.boxes is not None and sample.class_id is not None and len(sample.boxes):
             rows = np.empty((len(sample.boxes), 6), np.float32)
             rows[:, 0], rows[:, 1], rows[:, 2:] = index, sample.class_id, _centred(sample.boxes)

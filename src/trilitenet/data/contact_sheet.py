@@ -25,7 +25,8 @@ _TEXT_ROWS: Final = 18
 def draw_sample(sample: Sample, class_names: Sequence[str]) -> NDArray[np.uint8]:
     """Return the image with its labels: areas and markings blended, objects boxed, ignored regions in grey.
 
-    Pixels that are ignored by every task (the own car) are hatched. What is not labelled is not drawn.
+    Pixels that are ignored by every task (the own car) are hatched, those that one mask ignores the other way. What is
+    not labelled is not drawn.
 
     Args:
         sample: Of any size.
@@ -45,9 +46,10 @@ def draw_sample(sample: Sample, class_names: Sequence[str]) -> NDArray[np.uint8]
         None if sample.lane is None else sample.lane.astype(np.bool_),
     )
     canvas = draw(perception, sample.image, hide=("labels",))
-    if sample.valid is not None:
-        rows, columns = np.indices(sample.size)
-        canvas[~sample.valid & ((rows + columns) % 8 < 2)] = _INVALID_COLOUR
+    for valid, way in ((sample.valid, 1), (sample.drivable_valid, -1), (sample.lane_valid, -1)):
+        if valid is not None:
+            rows, columns = np.indices(sample.size)
+            canvas[~valid & ((rows + way * columns) % 8 < 2)] = _INVALID_COLOUR
     for x1, y1, x2, y2 in np.rint(sample.ignored).astype(int).tolist():
         cv2.rectangle(canvas, (x1, y1), (x2 - 1, y2 - 1), _IGNORED_COLOUR, 1)
     return canvas

@@ -2,7 +2,8 @@
 
     OUT/prepared.json                 canvas, classes, how images are stored
     OUT/{split}-000000.tar            per image NAME.jpg (or NAME.image.npy), NAME.drivable.npy, NAME.lane.npy,
-                                      NAME.valid.npy (where there are such masks) and NAME.json
+                                      NAME.valid.npy, NAME.drivable_valid.npy, NAME.lane_valid.npy (where there are
+                                      such masks) and NAME.json
     OUT/{split}-000000.index.jsonl    per image a line: where its parts are in the shard, and its boxes and attributes
 
 Images are resized to fit the canvas but not padded. Masks are packed bits along rows (`numpy.packbits`, axis 1). The
@@ -43,7 +44,7 @@ from trilitenet.data.reading import (
     SampleSource,
     decode_image,
 )
-from trilitenet.data.sample import Sample
+from trilitenet.data.sample import VALID, Sample
 from trilitenet.errors import ConfigError, DataError, OutputError, import_extra, replacing, writing
 from trilitenet.processing.letterbox import Letterbox
 
@@ -56,7 +57,10 @@ CACHE_FOLDER: Final = ".prepared"
 """A prepared copy in this folder of a data set is used by itself."""
 FORMAT: Final = 1
 
-_MASKS: Final = ("drivable", "lane", "valid")
+_LAYOUT: Final = 2
+"""Shards of another layout are written anew: those of 1 had one mask of validity for both tasks."""
+
+_MASKS: Final = ("drivable", "lane", *VALID)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +94,6 @@ def shrink(sample: Sample, canvas: tuple[int, int], mask_above: int = 1) -> Samp
     def mask(values: NDArray[np.uint8] | None, above: int) -> NDArray[np.uint8] | None:
         return None if values is None else bare.mask(values * np.uint8(255), above)
 
-    own = None if sample.valid is None else mask((~sample.valid).view(np.uint8), 1)
     return dataclasses.replace(
         sample,
         image=bare.image(sample.image),
@@ -98,7 +101,7 @@ def shrink(sample: Sample, canvas: tuple[int, int], mask_above: int = 1) -> Samp
         ignored=(sample.ignored * factor).astype(np.float32),
         drivable=mask(sample.drivable, mask_above),
         lane=mask(sample.lane, mask_above),
-        valid=None if own is None else own == 0,
+        **sample.change_valid(lambda valid: bare.mask((~valid).view(np.uint8) * np.uint8(255), 1) == 0),
     )
 
 
@@ -312,12 +315,11 @@ class PreparedDataset:
         masks: dict[str, NDArray[np.uint8] | None] = {}
         for key in _MASKS:
             packed = parts.get(f"{key}.npy")
-            if packed is None or (key != "valid" and self._tasks is not None and key not in self._tasks):
+            if packed is None or (key in ("drivable", "lane") and self._tasks is not None and key not in self._tasks):
                 masks[key] = None
             else:
                 masks[key] = np.unpackbits(packed.reshape(height, -1), axis=1, count=width)
         labelled = entry["boxes"] is not None and (self._tasks is None or "detection" in self._tasks)
-        valid = masks["valid"]
         return Sample(
             name=entry["name"],
             image=image,
@@ -326,7 +328,7 @@ class PreparedDataset:
             ignored=np.array(entry["ignored"], np.float32).reshape(-1, 4),
             drivable=masks["drivable"],
             lane=masks["lane"],
-            valid=None if valid is None else valid.view(np.bool_),
+            **{key: values.view(np.bool_) for key in VALID if (values := masks[key]) is not None},
             attributes=entry["attributes"],
         )
 
@@ -580,7 +582,7 @@ def _fingerprint(root: Path, split: str) -> list[int]:
 
 def _made_from(dataset: DrivingDataset) -> str:
     """Return the SHA-256 of which files samples are made from, how large they are and when they were written."""
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(f"layout {_LAYOUT}\n".encode())
     paths = [*_common_files(dataset.root)]
     for index, name in enumerate(dataset.names):
         paths += [dataset.image_path(index), dataset.root / DETECTION_FOLDER / dataset.split / f"{name}.json"]

@@ -252,10 +252,6 @@ class DrivingDataset:
                 boxes = class_id = None
         drivable, drivable_valid = self._mask("drivable", name, size)
         lane, lane_valid = self._mask("lane", name, size)
-        valid = self._ego(name, size)
-        for other in (drivable_valid, lane_valid):
-            if other is not None:
-                valid = other if valid is None else valid & other
         return Sample(
             name=name,
             image=image,
@@ -264,7 +260,9 @@ class DrivingDataset:
             ignored=ignored,
             drivable=drivable,
             lane=lane,
-            valid=valid,
+            valid=self._ego(name, size),
+            drivable_valid=drivable_valid,
+            lane_valid=lane_valid,
             attributes=attributes | self._extra.get(name, {}),
         )
 

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.errors import ShapeError
 
-__all__ = ["Sample"]
+__all__ = ["VALID", "Sample"]
+
+VALID: Final = ("valid", "drivable_valid", "lane_valid")
+"""The fields of a sample that say where masks count."""
 
 
 def _no_boxes() -> NDArray[np.float32]:
@@ -29,6 +34,8 @@ class Sample:
         drivable: (H, W) uint8, 1 = drivable, 0 = not; None = not labelled.
         lane: (H, W) uint8, 1 = lane marking, 0 = not; None = not labelled.
         valid: (H, W) bool, False where every task is ignored (the own car's bonnet); None = valid everywhere.
+        drivable_valid: (H, W) bool, False where the drivable mask alone says nothing; None = it speaks everywhere.
+        lane_valid: (H, W) bool, likewise for the lane mask.
         attributes: Weather, scene, time of day, source and the like.
 
     Raises:
@@ -43,6 +50,8 @@ class Sample:
     drivable: NDArray[np.uint8] | None = None
     lane: NDArray[np.uint8] | None = None
     valid: NDArray[np.bool_] | None = None
+    drivable_valid: NDArray[np.bool_] | None = None
+    lane_valid: NDArray[np.bool_] | None = None
     attributes: dict[str, str] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -59,12 +68,25 @@ class Sample:
                 )
         if self.ignored.ndim != 2 or self.ignored.shape[1] != 4:
             raise ShapeError(f"{self.name}: ignored must be (M, 4), got {self.ignored.shape}")
-        for field, dtype in (("drivable", np.uint8), ("lane", np.uint8), ("valid", np.bool_)):
+        for field in ("drivable", "lane", *VALID):
+            dtype = np.bool_ if field in VALID else np.uint8
             mask = getattr(self, field)
             if mask is not None and (mask.shape != self.size or mask.dtype != dtype):
                 raise ShapeError(
                     f"{self.name}: {field} must be {self.size} {np.dtype(dtype)}, got {mask.shape} {mask.dtype}"
                 )
+
+    def counted(self, task: Literal["drivable", "lane"]) -> NDArray[np.bool_] | None:
+        """Return (H, W) bool, True where a task's mask counts; None = everywhere."""
+        own = self.drivable_valid if task == "drivable" else self.lane_valid
+        if self.valid is None or own is None:
+            return own if self.valid is None else self.valid
+        return self.valid & own
+
+    def change_valid(self, change: Callable[[NDArray[np.bool_]], Any]) -> dict[str, Any]:
+        """Return the fields of `VALID` by name, those that are there changed."""
+        fields = {name: getattr(self, name) for name in VALID}
+        return {name: None if valid is None else change(valid) for name, valid in fields.items()}
 
     @property
     def size(self) -> tuple[int, int]:

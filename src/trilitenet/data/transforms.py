@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import check_size
 from trilitenet.data import photometric
-from trilitenet.data.sample import Sample
+from trilitenet.data.sample import VALID, Sample
 from trilitenet.errors import ConfigError
 from trilitenet.processing.letterbox import PAD_VALUE, Letterbox
 
@@ -177,12 +177,12 @@ def warp(sample: Sample, affine: Affine, canvas: tuple[int, int], mask_above: in
         "drivable": sample.drivable,
         "lane": sample.lane,
         # What comes from outside the image is not the own car: its mask is warped, and padded with 0.
-        "valid": None if sample.valid is None else (~sample.valid).view(np.uint8),
+        **sample.change_valid(lambda valid: (~valid).view(np.uint8)),
     }
     image, moved = _warp_together(
         _resize(sample.image, box),
         {
-            name: _resize_mask(mask, box, 1 if name == "valid" else mask_above)
+            name: _resize_mask(mask, box, 1 if name in VALID else mask_above)
             for name, mask in masks.items()
             if mask is not None
         },
@@ -202,7 +202,9 @@ def warp(sample: Sample, affine: Affine, canvas: tuple[int, int], mask_above: in
         ignored=ignored,
         drivable=_binary(moved.get("drivable"), mask_above),
         lane=_binary(moved.get("lane"), mask_above),
-        valid=None if sample.valid is None else moved["valid"] <= 1,
+        valid=_still_valid(moved.get("valid")),
+        drivable_valid=_still_valid(moved.get("drivable_valid")),
+        lane_valid=_still_valid(moved.get("lane_valid")),
     )
 
 
@@ -216,7 +218,7 @@ def flip(sample: Sample) -> Sample:
         ignored=_mirror(sample.ignored, width),
         drivable=None if sample.drivable is None else np.ascontiguousarray(sample.drivable[:, ::-1]),
         lane=None if sample.lane is None else np.ascontiguousarray(sample.lane[:, ::-1]),
-        valid=None if sample.valid is None else np.ascontiguousarray(sample.valid[:, ::-1]),
+        **sample.change_valid(lambda valid: np.ascontiguousarray(valid[:, ::-1])),
     )
 
 
@@ -297,10 +299,6 @@ class EvalTransform:
     ) -> Sample:
         """Return the sample at canvas size; all boxes are kept."""
         box = Letterbox.fit(sample.size, canvas=self.canvas)
-        valid = sample.valid
-        if valid is not None:
-            # What is outside the image is not the own car, so the padding stays valid.
-            valid = box.mask((~valid).astype(np.uint8) * 255) == 0
         return dataclasses.replace(
             sample,
             image=box.image(sample.image),
@@ -308,7 +306,8 @@ class EvalTransform:
             ignored=box.boxes(sample.ignored).astype(np.float32),
             drivable=_letterbox_mask(sample.drivable, box),
             lane=_letterbox_mask(sample.lane, box),
-            valid=valid,
+            # What is outside the image is not the own car, so the padding stays valid.
+            **sample.change_valid(lambda valid: box.mask((~valid).astype(np.uint8) * 255) == 0),
         )
 
 
@@ -396,7 +395,7 @@ def mosaic(tiles: Sequence[Sample], rng: np.random.Generator) -> Sample:
         arrays = [getattr(part, name) for part in parts]
         if all(array is None for array in arrays):
             return None
-        if name == "valid":
+        if name in VALID:
             arrays = [np.ones(p.size, np.bool_) if a is None else a for a, p in zip(arrays, parts, strict=True)]
         return join(arrays)
 
@@ -411,6 +410,8 @@ def mosaic(tiles: Sequence[Sample], rng: np.random.Generator) -> Sample:
         drivable=joined("drivable"),
         lane=joined("lane"),
         valid=joined("valid"),
+        drivable_valid=joined("drivable_valid"),
+        lane_valid=joined("lane_valid"),
     )
 
 
@@ -474,7 +475,7 @@ def _crop(sample: Sample, top: int, left: int, height: int, width: int) -> Sampl
         ignored=ignored,
         drivable=None if sample.drivable is None else sample.drivable[area],
         lane=None if sample.lane is None else sample.lane[area],
-        valid=None if sample.valid is None else sample.valid[area],
+        **sample.change_valid(lambda valid: valid[area]),
     )
 
 
@@ -527,6 +528,10 @@ def _warp_together(
 
 def _binary(grey: NDArray[np.uint8] | None, above: int) -> NDArray[np.uint8] | None:
     return None if grey is None else cv2.threshold(grey, above, 1, cv2.THRESH_BINARY)[1]
+
+
+def _still_valid(outside: NDArray[np.uint8] | None) -> NDArray[np.bool_] | None:
+    return None if outside is None else outside <= 1
 
 
 def _letterbox_mask(mask: NDArray[np.uint8] | None, box: Letterbox) -> NDArray[np.uint8] | None:

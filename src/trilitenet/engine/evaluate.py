@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, closing, nullcontext
-from typing import Any, Final, Protocol, TypeVar, runtime_checkable
+from typing import Any, Final, Literal, Protocol, TypeVar, runtime_checkable
 
 import cv2
 import numpy as np
@@ -28,7 +28,7 @@ from trilitenet.engine.predictions import SavedPredictions
 from trilitenet.engine.provenance import describe_hardware, describe_versions, peak_memory
 from trilitenet.engine.report import Provenance, Report
 from trilitenet.engine.scorecard import CONDITIONS, PAPER_THRESHOLDS, Scorecard, protocols_of
-from trilitenet.engine.scoring import CanvasPrediction, LabelledImage
+from trilitenet.engine.scoring import CanvasPrediction, LabelledImage, on_own_car
 from trilitenet.errors import ConfigError, DataError
 from trilitenet.metrics.detection import DetectionMetric
 from trilitenet.processing.letterbox import Letterbox
@@ -443,15 +443,22 @@ def best_thresholds(
         if raw.detection is not None:
             boxes: Boxes = select_boxes(raw.detection[index], letterbox, low)
             detection.update(
-                boxes.xyxy, boxes.confidence, boxes.class_id, sample.boxes, sample.class_id, sample.ignored
+                boxes.xyxy,
+                boxes.confidence,
+                boxes.class_id,
+                sample.boxes,
+                sample.class_id,
+                sample.ignored,
+                on_own_car(sample, boxes.xyxy),
             )
-        pairs: tuple[tuple[Task, NDArray[np.uint8] | None, NDArray[np.uint8] | None], ...] = (
+        pairs: tuple[tuple[Literal["drivable", "lane"], NDArray[np.uint8] | None, NDArray[np.uint8] | None], ...] = (
             ("drivable", raw.drivable, sample.drivable),
             ("lane", raw.lane, sample.lane),
         )
         for task, masks, truth in pairs:
             if masks is not None and truth is not None:
-                counts[task] += _probability_counts(letterbox.mask_to_source(masks[index]), truth, sample.valid)
+                probability = letterbox.mask_to_source(masks[index])
+                counts[task] += _probability_counts(probability, truth, sample.counted(task))
 
     outputs = closing(_outputs(predictor, dataset, batch_size, limit, None))
     with outputs as batches, _InOrder() as looking:

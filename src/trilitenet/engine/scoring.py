@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +32,7 @@ __all__ = [
     "LabelledImage",
     "PaperMetrics",
     "PaperScores",
+    "on_own_car",
 ]
 
 
@@ -53,8 +55,29 @@ class LabelledImage(Protocol):
     def lane(self) -> NDArray[np.uint8] | None: ...  # noqa: D102
     @property
     def valid(self) -> NDArray[np.bool_] | None: ...  # noqa: D102
+    def counted(self, task: Literal["drivable", "lane"]) -> NDArray[np.bool_] | None: ...  # noqa: D102
     @property
     def attributes(self) -> dict[str, str]: ...  # noqa: D102
+
+
+def on_own_car(sample: LabelledImage, boxes: NDArray[np.floating] | None) -> NDArray[np.bool_] | None:
+    """Return which predicted boxes lie by more than half on the own car; None = none does.
+
+    Args:
+        sample: The labels.
+        boxes: (D, 4) predicted xyxy px of the sample's image, or None.
+
+    Returns:
+        (D,) bool.
+    """
+    if sample.valid is None or boxes is None or not len(boxes):
+        return None
+    sums = cv2.integral((~sample.valid).view(np.uint8))
+    height, width = sample.valid.shape
+    corners = np.rint(boxes).clip(0, (width, height, width, height)).astype(np.intp)
+    left, top, right, bottom = corners.T
+    own = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    return np.asarray(2 * own > (right - left) * (bottom - top))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,17 +161,18 @@ class FairMetrics:
                 sample.boxes,
                 sample.class_id,
                 sample.ignored,
+                on_own_car(sample, None if boxes is None else boxes.xyxy),
             )
             if counts is not None:
                 right, wrong, missed = counts
                 if sum(counts):
                     detection = 2 * right / (2 * right + wrong + missed)
         if self.drivable is not None:
-            pixels = self.drivable.update(prediction.drivable, sample.drivable, sample.valid)
+            pixels = self.drivable.update(prediction.drivable, sample.drivable, sample.counted("drivable"))
             if pixels is not None and any(pixels[:3]):
                 drivable = pixels[0] / sum(pixels[:3])
         if self.lane is not None:
-            lane = self.lane.update(prediction.lane, sample.lane, sample.valid)
+            lane = self.lane.update(prediction.lane, sample.lane, sample.counted("lane"))
         return ImageOutcome(detection, drivable, lane, right, wrong, missed)
 
     def compute(self) -> FairScores:

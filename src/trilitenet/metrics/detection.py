@@ -204,6 +204,7 @@ class DetectionMetric:
         truth: NDArray[Any] | None,
         truth_class: NDArray[Any] | None,
         ignored: NDArray[Any] | None = None,
+        neutral: NDArray[np.bool_] | None = None,
     ) -> tuple[int, int, int] | None:
         """Add an image.
 
@@ -214,6 +215,8 @@ class DetectionMetric:
             truth: (G, 4) true boxes; None = not labelled.
             truth_class: (G,) class ids.
             ignored: (M, 4) ignored regions, of any class.
+            neutral: (D,) predicted boxes that are not wrong where they meet no true box; those in ``ignored`` need not
+                be among them.
 
         Returns:
             Right boxes, wrong boxes and missed objects of the image at the stated confidence; None where the image
@@ -231,6 +234,7 @@ class DetectionMetric:
             self._objects.append(objects.ravel())
             return None
         regions = np.zeros((0, 4)) if ignored is None else np.asarray(ignored, np.float64).reshape(-1, 4)
+        pardoned = np.zeros(len(boxes), np.bool_) if neutral is None else np.asarray(neutral, np.bool_)
         order = np.argsort(-np.asarray(scores, np.float32), kind="stable")
         for number in range(len(self.class_names)):
             picked = order[np.asarray(class_id)[order] == number][: self.max_boxes]
@@ -238,7 +242,7 @@ class DetectionMetric:
             objects[number] = self._in_range(box_area(true)).sum(axis=1)
             if not len(picked):
                 continue
-            matched, passed = self._match(np.asarray(boxes, np.float64)[picked], true, regions)
+            matched, passed = self._match(np.asarray(boxes, np.float64)[picked], true, regions, pardoned[picked])
             self._scores.append(np.asarray(scores, np.float32)[picked, None])
             self._image.append(np.full((len(picked), 1), index))
             self._class.append(np.full((len(picked), 1), number))
@@ -247,7 +251,12 @@ class DetectionMetric:
         self._objects.append(objects.ravel())
         kept = order[np.asarray(scores)[order] > self.confidence]
         return self._confuse(
-            np.asarray(boxes, np.float64)[kept], np.asarray(class_id)[kept], truth, truth_class, regions
+            np.asarray(boxes, np.float64)[kept],
+            np.asarray(class_id)[kept],
+            truth,
+            truth_class,
+            regions,
+            pardoned[kept],
         )
 
     def _in_range(self, area: FloatArray) -> NDArray[np.bool_]:
@@ -255,7 +264,7 @@ class DetectionMetric:
         return (area >= self._ranges[:, :1]) & (area <= self._ranges[:, 1:])
 
     def _match(
-        self, boxes: FloatArray, truth: FloatArray, regions: FloatArray
+        self, boxes: FloatArray, truth: FloatArray, regions: FloatArray, pardoned: NDArray[np.bool_]
     ) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
         """Match sorted boxes of one class: (D, areas) bits an IoU threshold of right boxes and of ignored ones."""
         limits = np.minimum(self._thresholds, 1 - 1e-10)
@@ -266,6 +275,7 @@ class DetectionMetric:
         overlap = box_overlap(boxes, truth)
         cover = box_cover(boxes, regions)
         in_region = cover.max(axis=1)[:, None] >= limits if len(regions) else np.zeros((count, len(limits)), np.bool_)
+        in_region = in_region | pardoned[:, None]
         # Boxes near no true box: wrong, unless in an ignored region or outside the area range.
         passed[:] = np.where(
             outside.T, np.uint16(bits.sum()), (in_region * bits).sum(axis=1).astype(np.uint16)[:, None]
@@ -303,11 +313,12 @@ class DetectionMetric:
         truth: NDArray[Any],
         truth_class: NDArray[Any],
         regions: FloatArray,
+        pardoned: NDArray[np.bool_],
     ) -> tuple[int, int, int]:
         """Match sorted boxes to true ones of any class at IoU 0.5, into the confusion matrix."""
         background = len(self.class_names)
         overlap = box_overlap(boxes, np.asarray(truth, np.float64).reshape(-1, 4))
-        covered: NDArray[np.bool_] = np.max(box_cover(boxes, regions), axis=1, initial=0) >= 0.5
+        covered = pardoned | (np.max(box_cover(boxes, regions), axis=1, initial=0) >= 0.5)
         classes = np.asarray(truth_class, np.int64)
         free: NDArray[np.bool_] = np.ones(len(truth), np.bool_)
         right = wrong = 0
