@@ -71,6 +71,8 @@ def test_convert_wants_its_words(raw: Path, tmp_path: Path) -> None:
         convert("bdd100k", raw, tmp_path / "out", lane_width=["wide"])
     with pytest.raises(ConfigError, match="above 0 and finite, got 'train=nan'"):
         convert("bdd100k", raw, tmp_path / "out", lane_width=["train=nan"])
+    with pytest.raises(ConfigError, match="no split 'trian'; there are train, val"):
+        convert("bdd100k", raw, tmp_path / "out", lane_width=["trian=8", "4"])
 
 
 @pytest.mark.parametrize(

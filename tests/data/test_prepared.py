@@ -249,3 +249,10 @@ def test_errors(root: Path, tmp_path: Path) -> None:
     (tmp_path / "out/prepared.json").write_text("{}")
     with pytest.raises(DataError, match="format None"):
         PreparedDataset(tmp_path / "out", "val")
+
+
+def test_a_split_without_images_is_left_out(root: Path, tmp_path: Path) -> None:
+    (root / "images" / "test").mkdir()
+    assert set(prepare(root, tmp_path / "out", canvas=CANVAS)) == {"train", "val"}
+    with pytest.raises(DataError, match="no images"):
+        prepare(root, tmp_path / "other", canvas=CANVAS, splits=["test"])

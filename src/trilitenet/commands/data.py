@@ -138,6 +138,9 @@ def convert(
         images=images,
     )
     records, found = _open_source(chosen, raw, mapping, options)
+    unknown = {item.rpartition("=")[0] for item in lane_width} - {"", "*", *records.splits}
+    if unknown:
+        raise ConfigError(f"--lane-width names no split {min(unknown)!r}; there are {', '.join(records.splits)}")
     description = DatasetDescription(
         name=mapping.name or out.name, licence=mapping.licence, source=f"{chosen}: {Path(raw).name}"
     )

@@ -38,6 +38,7 @@ from trilitenet.data.description import read_description
 from trilitenet.data.reading import (
     DETECTION_FOLDER,
     DRIVABLE_FOLDER,
+    IMAGE_ENDINGS,
     IMAGE_FOLDER,
     LANE_FOLDER,
     DrivingDataset,
@@ -126,7 +127,7 @@ def prepare(
         out: Folder to write; ``root/.prepared`` if left out, which loading then uses by itself.
         canvas: (height, width) that training will use.
         class_names: Detection classes; those of ``dataset.yaml``.
-        splits: Only these; all if left out.
+        splits: Only these; all that have images if left out.
         images: ``raw`` is exact and quickest to read; ``jpeg`` takes about a sixth of the room.
         quality: Of the JPEGs, of 100.
         mask_above: An area-resized mask pixel (0 to 255) above this is foreground (the published rule: 1).
@@ -147,10 +148,15 @@ def prepare(
     names = tuple(class_names or read_description(root).class_names)
     _check(canvas, quality, mask_above, shard_size)
     plan = _Plan(root, out, canvas, names, images, quality, mask_above)
-    folders = sorted(path.name for path in (root / IMAGE_FOLDER).glob("*") if path.is_dir())
-    chosen = list(splits) if splits is not None else folders
+    if splits is not None:
+        chosen = list(splits)
+    else:
+        folders = sorted(path for path in (root / IMAGE_FOLDER).glob("*") if path.is_dir())
+        chosen = [path.name for path in folders if any(file.suffix.lower() in IMAGE_ENDINGS for file in path.iterdir())]
     if not chosen:
-        raise DataError(f"{root}: no splits below {IMAGE_FOLDER}; expected the published layout, see docs/data.md")
+        raise DataError(
+            f"{root}: no splits with images below {IMAGE_FOLDER}; expected the published layout, see docs/data.md"
+        )
     datasets = {split: DrivingDataset(root, split, class_names=names) for split in chosen}
     with writing(out):
         _open_out(plan)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -164,3 +165,16 @@ def test_names_beyond_ascii_keep_their_labels(tmp_path: Path, ascii_only: bool) 
     path.write_text(json.dumps(content, ensure_ascii=ascii_only), encoding="utf-8")
     (raw / "images/100k/train/a1.jpg").rename(raw / "images/100k/train/stra\u00dfe \u65e5.jpg")
     assert read_bdd100k(raw).record("train", "stra\u00dfe \u65e5").objects
+
+
+def test_two_images_of_one_name_are_told_and_a_copy_is_not(tmp_path: Path) -> None:
+    root = tmp_path / "bdd100k"
+    raw_bdd.write_images(root)
+    raw_bdd.write_2020(root)
+    folder = next(path for path in root.rglob("train") if "images" in path.parts)
+    other = root / "more" / folder.relative_to(root)
+    shutil.copytree(folder, other)
+    assert read_bdd100k(root).names("train") == ["a1", "a2"]
+    cv2.imwrite(str(next(other.glob("a1.*"))), np.zeros((9, 9, 3), np.uint8))
+    with pytest.raises(DataError, match="two images are called 'a1'"):
+        read_bdd100k(root)

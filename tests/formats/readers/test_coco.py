@@ -69,9 +69,9 @@ def test_polygons_crowds_and_layouts(tmp_path: Path, place: str) -> None:
     assert sample.drivable is not None
     assert sample.drivable.sum() == 400
     assert sample.drivable[20:40, 10:30].all()
-    assert sample.valid is not None
-    assert (~sample.valid).sum() == 200
-    assert not sample.valid[20:40, 40:50].any()
+    assert sample.drivable_valid is not None
+    assert (~sample.drivable_valid).sum() == 200
+    assert not sample.drivable_valid[20:40, 40:50].any()
     assert sample.lane is None  # no category of lanes, so they are not labelled
     assert report.dropped["val"] == {"road: without a segmentation": 1}
 

@@ -53,8 +53,9 @@ def test_colours_and_ids(root: Path, tmp_path: Path) -> None:
     assert sample.drivable is not None
     assert np.flatnonzero(sample.drivable.all(axis=1)).tolist() == list(range(10, 30))
     assert sample.drivable.sum() == 20 * SIZE[1]
-    assert sample.valid is not None
-    assert np.flatnonzero(~sample.valid.any(axis=1)).tolist() == list(range(30, 35))
+    assert sample.valid is None
+    assert sample.drivable_valid is not None
+    assert np.flatnonzero(~sample.drivable_valid.any(axis=1)).tolist() == list(range(30, 35))
     assert sample.lane is not None
     assert np.flatnonzero(sample.lane.any(axis=1)).tolist() == [5]
     assert sample.boxes is None

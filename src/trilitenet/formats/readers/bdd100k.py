@@ -27,7 +27,7 @@ from typing import Any, Final
 from trilitenet.config import TASKS, Task
 from trilitenet.data.rasterise import flatten
 from trilitenet.data.reading import IMAGE_ENDINGS
-from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel
+from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel, same_name
 from trilitenet.errors import DataError, brief
 
 __all__ = ["BDD100K_SPLITS", "BddSource", "parse_labels", "read_bdd100k"]
@@ -448,14 +448,20 @@ def _survey(root: Path) -> tuple[dict[str, Path], list[Path]]:
 
 
 def _images(folders: dict[str, Path], split: str) -> dict[str, Path]:
-    """Return image name -> path of a split."""
+    """Return image name -> path of a split.
+
+    Raises:
+        DataError: If two images have one name.
+    """
     for pattern in (rf"images/100k/{split}", rf"100k/{split}", rf"images/{split}", rf"{split}"):
         images: dict[str, Path] = {}
         for where, folder in folders.items():
             if re.search(rf"(^|/){pattern}$", where) and "label" not in where:
-                for entry in os.scandir(folder):
-                    if entry.name.lower().endswith(IMAGE_ENDINGS[:2]):
-                        images[Path(entry.name).stem] = Path(entry.path)
+                for path in sorted(folder.iterdir()):
+                    if path.suffix.lower() in IMAGE_ENDINGS[:2]:
+                        first = images.setdefault(path.stem, path)
+                        if first.stat().st_size != path.stat().st_size:  # else it is a copy
+                            raise same_name(path.stem, split, first, path)
         if images:
             return images
     return {}
