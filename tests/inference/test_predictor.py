@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from PIL import Image
 
 from tests.fakes import ColourBackend, coloured_scene
-from trilitenet.config import Thresholds
+from trilitenet.config import ArtefactInfo, Thresholds
 from trilitenet.errors import ConfigError, InputError, ShapeError
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.predictor import Predictor
@@ -113,3 +114,18 @@ def test_it_closes_its_backend() -> None:
     with Predictor(backend):
         pass
     assert backend.closed == 1
+
+
+def test_thresholds_that_a_file_fixes_inside_are_refused() -> None:
+    backend = ColourBackend()
+    own = backend.card.thresholds
+    backend.info = ArtefactInfo("onnx", masks="probability", nms=True)  # type: ignore[attr-defined]
+    assert Predictor(backend).least_confidence == own.confidence
+    Predictor(backend, dataclasses.replace(own, confidence=0.99, iou=own.iou / 2, drivable=0.9))
+    for wrong in (dataclasses.replace(own, confidence=own.confidence / 2), dataclasses.replace(own, iou=0.99)):
+        with pytest.raises(ConfigError, match="export it without --nms"):
+            Predictor(backend, wrong)
+    backend.info = ArtefactInfo("onnx")  # type: ignore[attr-defined]
+    assert Predictor(backend, dataclasses.replace(own, confidence=0.01)).least_confidence == 0
+    with pytest.raises(ConfigError, match="--masks probability"):
+        Predictor(backend, dataclasses.replace(own, lane=0.9))

@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 from typing import Final
 
-from trilitenet.config import VARIANTS, ArtefactInfo, ModelCard, Thresholds
+from trilitenet.config import VARIANTS, ModelCard, Thresholds
 from trilitenet.errors import ConfigError, did_you_mean
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.exported import is_int8_onnx
@@ -70,20 +70,12 @@ def load(
     if backend not in BACKENDS:
         raise ConfigError(f"unknown backend {backend!r}{did_you_mean(backend, BACKENDS)}")
     runtime = _open(model, device, backend, streams, threads)
-    info: ArtefactInfo | None = getattr(runtime, "info", None)
-    if info is not None and info.decides_masks and (drivable is not None or lane is not None):
-        raise ConfigError(
-            f"{model} decides masks inside, by the thresholds of the model it was exported from; "
-            "for others export it with --masks probability"
-        )
     thresholds = _override(runtime.card, confidence=confidence, iou=iou, drivable=drivable, lane=lane)
-    inside = runtime.card.thresholds
-    if info is not None and info.nms and (thresholds.confidence < inside.confidence or thresholds.iou > inside.iou):
-        raise ConfigError(
-            f"{model} suppresses boxes inside, at confidence {inside.confidence:g} and IoU {inside.iou:g}; "
-            "for a lower confidence or a higher IoU export it without --nms"
-        )
-    return Predictor(runtime, thresholds, long_side=long_side, batch_size=batch_size)
+    try:
+        return Predictor(runtime, thresholds, long_side=long_side, batch_size=batch_size)
+    except ConfigError as error:
+        runtime.close()
+        raise ConfigError(f"{model}: {error}") from error
 
 
 def _open(model: str | os.PathLike[str], device: str, backend: str, streams: int, threads: int | None) -> Backend:

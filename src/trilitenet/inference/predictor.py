@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from trilitenet.config import ModelCard, Thresholds
+from trilitenet.config import ArtefactInfo, ModelCard, Thresholds
 from trilitenet.errors import ConfigError, ShapeError
 from trilitenet.inference.backend import Backend
 from trilitenet.processing.images import read_image
@@ -42,7 +42,7 @@ class Predictor:
         batch_size: At most so many images go through the network at once.
 
     Raises:
-        ConfigError: If a size is not positive.
+        ConfigError: If a size is not positive, or the backend's file fixes thresholds inside and others are asked for.
     """
 
     def __init__(
@@ -58,6 +58,7 @@ class Predictor:
             raise ConfigError(f"long_side and batch_size must be at least 1, got {long_side} and {batch_size}")
         self.backend = backend
         self.thresholds = thresholds or backend.card.thresholds
+        self._check_thresholds()
         self.long_side = long_side
         self.batch_size = batch_size
 
@@ -65,6 +66,28 @@ class Predictor:
     def card(self) -> ModelCard:
         """What the network is: classes, tasks, training data, figures, licence."""
         return self.backend.card
+
+    @property
+    def least_confidence(self) -> float:
+        """Boxes below are gone before they could be asked for: an artefact with ``--nms`` drops them inside."""
+        info: ArtefactInfo | None = getattr(self.backend, "info", None)
+        return self.card.thresholds.confidence if info is not None and info.nms else 0.0
+
+    def _check_thresholds(self) -> None:
+        info: ArtefactInfo | None = getattr(self.backend, "info", None)
+        wanted, inside = self.thresholds, self.card.thresholds
+        if info is None:
+            return
+        if info.decides_masks and (wanted.drivable, wanted.lane) != (inside.drivable, inside.lane):
+            raise ConfigError(
+                "this artefact decides masks inside, by the thresholds of the model it was exported from; "
+                "for others export it with --masks probability"
+            )
+        if info.nms and (wanted.confidence < self.least_confidence or wanted.iou > inside.iou):
+            raise ConfigError(
+                f"this artefact suppresses boxes inside, at confidence {inside.confidence:g} and IoU {inside.iou:g}; "
+                "for a lower confidence or a higher IoU export it without --nms"
+            )
 
     @property
     def class_names(self) -> tuple[str, ...]:

@@ -85,7 +85,7 @@ def rest_router(service: Service) -> APIRouter:
             "name": service.name,
             "backend": service.predictor.backend.name,
             "ready": service.ready,
-            "least_confidence": service.least_confidence,
+            "least_confidence": service.predictor.least_confidence,
             "max_images": service.settings.max_images,
             "card": card,
         }

@@ -28,7 +28,6 @@ from trilitenet.apps.server.intake import Header, MemoryBudget, decode
 from trilitenet.apps.server.metrics import Metrics
 from trilitenet.apps.server.problems import BusyError, ProblemError
 from trilitenet.apps.server.settings import Settings
-from trilitenet.config import ArtefactInfo
 from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.structures import Perception, RawOutputs
@@ -76,9 +75,6 @@ class Service:
 
     def __init__(self, predictor: Predictor, name: str, settings: Settings) -> None:
         self.predictor = predictor
-        info: ArtefactInfo | None = getattr(predictor.backend, "info", None)
-        self.least_confidence = predictor.card.thresholds.confidence if info is not None and info.nms else 0.0
-        """An artefact that suppresses boxes inside has none below."""
         self.name = name
         self.settings = settings
         self.card = predictor.card
@@ -171,11 +167,11 @@ class Service:
             ProblemError: If the image is broken.
         """
         predictor = self.predictor
-        if confidence is not None and confidence < self.least_confidence:
+        if confidence is not None and confidence < predictor.least_confidence:
             raise ProblemError(
                 422,
                 "confidence_too_low",
-                f"this model drops boxes below {self.least_confidence:g} itself; ask for that or more",
+                f"this model drops boxes below {predictor.least_confidence:g} itself; ask for that or more",
             )
         if confidence is not None:
             thresholds = dataclasses.replace(predictor.thresholds, confidence=confidence)
