@@ -207,3 +207,16 @@ def test_split_gives_views_and_keeps_what_is_missing(missing: str) -> None:
             else:
                 np.testing.assert_array_equal(part, whole[index : index + 1])
                 assert part.base is not None
+
+
+def test_time_that_went_to_refused_images_is_not_charged_to_the_next() -> None:
+    clock = Clock()
+    admission = Admission(64, patience=6.0, clock=clock)
+    admission.enter(3)
+    for _ in range(100):
+        clock.now += 1.0
+        admission.skip()
+    clock.now += 0.1
+    admission.observe(1)
+    assert admission.seconds_each == pytest.approx(0.1)
+    admission.enter(10)

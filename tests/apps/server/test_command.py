@@ -93,3 +93,12 @@ def test_mistakes_are_told_in_one_line(started: list[Any], tmp_path: Path, capsy
 def test_settings_must_fit_each_other() -> None:
     with pytest.raises(ConfigError, match="max_images"):
         Settings(queue=4, max_images=5)
+    with pytest.raises(ConfigError, match="memory"):
+        Settings(max_pixels=200_000_000)
+
+
+@pytest.mark.parametrize("name", ["deadline", "drain", "batch_delay", "upload_timeout"])
+@pytest.mark.parametrize("value", [float("inf"), float("nan")])
+def test_every_limit_is_finite(name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=f"{name} must be positive and finite"):
+        Settings(**{name: value})  # type: ignore[arg-type]

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from tests.apps.server.conftest import TOKEN, FakeBackend, MakeApp
+from tests.apps.server.conftest import TOKEN, FakeBackend, MakeApp, encode
 from trilitenet.apps.server.application import Application
 
 
@@ -145,6 +147,28 @@ def test_a_client_that_vanishes_while_waiting_leaves_the_queue(
     asyncio.run(run())
 
 
+def test_an_answer_is_held_in_the_memory_budget_until_it_is_read(app: Application) -> None:
+    data = encode(np.random.default_rng(0).integers(0, 256, (400, 400, 3), np.uint8), "PNG")
+    pieces = [{"type": "http.request", "body": data, "more_body": False}]
+    held: list[tuple[int, int]] = []
+
+    def on_send(message: dict[str, Any]) -> None:
+        held.append((len(message.get("body", b"")), app.service.memory.used))
+
+    async def run() -> None:
+        await app.service.start()
+        headers = [(b"content-length", b"%d" % len(data)), (b"accept", b"image/png")]
+        await _request(app, headers, pieces, b"format=overlay", on_send)
+        await app.service.stop()
+
+    asyncio.run(run())
+    _, (size, meanwhile), (last, afterwards) = held
+    # The server takes the last, empty piece only when the client has read the one before.
+    assert size > 2**16
+    assert (last, meanwhile, afterwards) == (0, size, size)
+    assert app.service.memory.used == 0
+
+
 def test_the_log_names_requests_and_nothing_of_their_content(
     client: TestClient, jpeg: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -163,7 +187,11 @@ def _call(app: Application, headers: list[tuple[bytes, bytes]], pieces: list[dic
 
 
 async def _request(
-    app: Application, headers: list[tuple[bytes, bytes]], pieces: list[dict[str, Any]]
+    app: Application,
+    headers: list[tuple[bytes, bytes]],
+    pieces: list[dict[str, Any]],
+    query: bytes = b"",
+    on_send: Callable[[dict[str, Any]], None] = lambda message: None,
 ) -> list[dict[str, Any]]:
     """Send one request piece by piece; after the last, the client is silent."""
     left = list(pieces)
@@ -175,6 +203,7 @@ async def _request(
         return left.pop(0)
 
     async def send(message: Any) -> None:
+        on_send(message)
         sent.append(dict(message))
 
     scope = {
@@ -186,7 +215,7 @@ async def _request(
         "path": "/v1/predict",
         "raw_path": b"/v1/predict",
         "root_path": "",
-        "query_string": b"",
+        "query_string": query,
         "headers": headers,
         "client": ("127.0.0.1", 1),
         "server": ("127.0.0.1", 2),

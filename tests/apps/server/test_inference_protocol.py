@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import base64
 import json
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,7 @@ from starlette.testclient import TestClient
 
 from tests.apps.server.conftest import MakeApp, Running, encode, picture
 from trilitenet.apps.server.application import Application
+from trilitenet.apps.server.problems import ProblemError
 
 
 def test_tritons_client_gets_right_answers(app: Application, run_app: Callable[[Application], Running]) -> None:
@@ -104,7 +106,7 @@ def test_malformed_requests_are_refused(client: TestClient, body: Any, status: i
     assert message in answer.json()["error"]
 
 
-@pytest.mark.parametrize("length", ["5", "x", "-1"])
+@pytest.mark.parametrize("length", ["5", "x", "-1", "0" * 20 + "9" * 4400])
 def test_a_wrong_header_length_is_refused(client: TestClient, length: str) -> None:
     answer = client.post("/v2/models/tiny/infer", content="{}", headers={"inference-header-content-length": length})
     assert answer.status_code == 400
@@ -133,3 +135,90 @@ def test_a_full_queue_is_told_in_the_protocols_form(make_app: MakeApp) -> None:
     assert answer.status_code == 503
     assert int(answer.headers["retry-after"]) >= 1
     assert "places are taken" in answer.json()["error"]
+
+
+def _file(width: int, height: int) -> dict[str, Any]:
+    encoded = base64.b64encode(encode(np.zeros((height, width, 3), np.uint8), "PNG")).decode()
+    return _tensor(datatype="BYTES", shape=[1], data=[encoded])
+
+
+def test_masks_as_json_have_a_largest_size(client: TestClient) -> None:
+    request = _file(2001, 2000)
+    answer = client.post("/v2/models/tiny/infer", json=request)
+    assert answer.status_code == 413
+    assert "ask for binary_data" in answer.json()["error"]
+    binary = client.post("/v2/models/tiny/infer", json={**request, "parameters": {"binary_data_output": True}})
+    boxes = client.post("/v2/models/tiny/infer", json={**request, "outputs": [{"name": "boxes"}]})
+    assert binary.status_code == boxes.status_code == 200
+    assert len(binary.content) > 2 * 2001 * 2000
+
+
+def test_masks_as_json_are_zeros_and_ones(client: TestClient, app: Application) -> None:
+    pixels = picture(80, 60)
+    request = _tensor(shape=[1, 60, 80, 3], data=pixels.tolist())
+    outputs = {
+        output["name"]: output for output in client.post("/v2/models/tiny/infer", json=request).json()["outputs"]
+    }
+    seen = app.service.predictor(pixels)
+    for name, mask in (("drivable", seen.drivable), ("lane", seen.lane)):
+        assert mask is not None
+        assert outputs[name]["shape"] == [1, 60, 80]
+        assert outputs[name]["data"] == mask.astype(int).ravel().tolist()
+
+
+@pytest.mark.parametrize("value", [b"[[]]", b"{}", b"1"])
+def test_json_of_too_many_values_is_refused_unparsed(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch, value: bytes
+) -> None:
+    body = b'{"inputs":[' + b",".join([value] * 1_500_000) + b"]}"
+    monkeypatch.setattr("trilitenet.apps.server.inference_protocol._parse", None)
+    answer = client.post("/v2/models/tiny/infer", content=body)
+    assert answer.status_code == 413
+    assert "binary form" in answer.json()["error"]
+
+
+def test_pixels_as_numbers_fit_up_to_640_x_480(client: TestClient) -> None:
+    request = _tensor(shape=[1, 480, 640, 3], data=np.zeros((480, 640, 3), int).tolist())
+    request["outputs"] = [{"name": "boxes"}]
+    assert client.post("/v2/models/tiny/infer", json=request).status_code == 200
+
+
+def test_what_is_parsed_is_paid_for_and_has_a_place(
+    client: TestClient, app: Application, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def parse(body: bytes, *_: Any) -> Any:
+        assert app.service.admission.taken == 1
+        assert app.service.memory.used > 64 * body.count(b",") + 256 * body.count(b"[")
+        raise ProblemError(400, "seen", "seen")
+
+    monkeypatch.setattr("trilitenet.apps.server.inference_protocol._parse", parse)
+    assert client.post("/v2/models/tiny/infer", json=_tensor()).json()["error"] == "seen"
+    assert app.service.memory.used == app.service.admission.taken == 0
+
+
+def test_an_answer_is_written_within_the_deadline(make_app: MakeApp, monkeypatch: pytest.MonkeyPatch) -> None:
+    app = make_app(deadline=0.3)
+    done = threading.Event()
+    monkeypatch.setattr("trilitenet.apps.server.inference_protocol._answer", lambda *_: done.wait(20))
+    with TestClient(app) as client:
+        answer = client.post("/v2/models/tiny/infer", json=_tensor())
+        done.set()
+    assert answer.status_code == 503
+
+
+def test_texts_in_place_of_numbers_take_no_more_than_they_are_long(client: TestClient) -> None:
+    # As an array of texts these would take 100,000 x 100,000 x 4 bytes.
+    request = _tensor(data=["a" * 100_000] + [""] * 100_000)
+    answer = client.post("/v2/models/tiny/infer", json=request)
+    assert answer.status_code == 400
+    assert "0 to 255" in answer.json()["error"]
+
+
+def test_several_images_take_as_many_places(make_app: MakeApp) -> None:
+    app = make_app(queue=2, max_images=2)
+    request = _tensor(shape=[2, 2, 2, 3], data=[0] * 24)
+    with TestClient(app) as client:
+        assert client.post("/v2/models/tiny/infer", json=request).status_code == 200
+        with app.service.admit(1):
+            assert client.post("/v2/models/tiny/infer", json=request).status_code == 503
+    assert app.service.admission.taken == 0

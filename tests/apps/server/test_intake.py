@@ -109,3 +109,53 @@ def test_memory_is_given_back() -> None:
             assert budget.used == 100
         assert budget.used == 60
     assert budget.used == 0
+
+
+def test_a_request_that_never_fits_is_told_so() -> None:
+    with Reservation(MemoryBudget(100)) as reservation:
+        reservation.take(60)
+        with pytest.raises(ProblemError, match="more than 100 bytes") as caught:
+            reservation.take(41)
+        assert caught.value.status == 413
+        reservation.keep(10)
+        assert reservation.budget.used == 10
+        reservation.keep(50)
+        assert reservation.budget.used == 10
+
+
+def test_what_follows_a_jpeg_is_no_part_of_it() -> None:
+    data = encode(picture(61, 47), "JPEG")
+    assert read_header(data + b"\xff\xda" * 5000) == Header("JPEG", 61, 47, 1)
+
+
+def test_what_segments_hold_counts_as_no_scan_and_no_end() -> None:
+    data = encode(picture(61, 47), "JPEG", progressive=True)
+    scans = read_header(data).scans
+    start = data.index(b"\xff\xda")
+    segment = b"\xff\xe1\x00\x0a" + b"\xff\xd9\xff\xda" * 2
+    assert scans > 5
+    assert read_header(data[:start] + segment + data[start:]).scans == scans
+
+
+@pytest.mark.parametrize(
+    "between",
+    [
+        b"\xff\x00\xff\xd3\xff",  # stuffing, a restart, a fill byte
+        b"\xff\x02\x40\x00",  # a marker that a decoder passes over, whatever its length says
+        bytes(9000) + b"\x00",
+        bytes(4095 - 8),
+        bytes(4096 - 8),
+    ],
+)
+def test_every_scan_is_found(between: bytes) -> None:
+    data = encode(picture(61, 47), "JPEG")
+    scan = b"\xff\xda\x00\x08\x01\x01\x00\x00\x3f\x00" + between
+    assert read_header(data[:-2] + 300 * scan + data[-2:]).scans == 301
+
+
+def test_endless_segments_are_refused() -> None:
+    data = encode(picture(61, 47), "JPEG")
+    for place in (2, len(data) - 2):
+        with pytest.raises(ProblemError, match="segments") as caught:
+            read_header(data[:place] + b"\xff\xfe\x00\x02" * 10_000 + data[place:])
+        assert caught.value.status == 413

@@ -214,3 +214,45 @@ def test_the_schema_describes_every_route_with_examples(app: Application) -> Non
     BatchPrediction.model_validate(batch["responses"]["200"]["content"]["application/json"]["example"])
     assert "multipart/form-data" in predict["requestBody"]["content"]
     assert "Retry-After" in predict["responses"]["503"]["headers"]
+
+
+def test_a_batch_beyond_all_memory_refuses_what_does_not_fit(make_app: MakeApp) -> None:
+    file = encode(picture(400, 300), "PNG")
+    with TestClient(make_app(memory=3_000_000, max_body=100_000, max_pixels=200_000)) as client:
+        answer = client.post("/v1/predict/batch", files=[("images", ("a", file))] * 3)
+        assert [result["status"] for result in answer.json()["results"]] == [200, 200, 413]
+        assert "memory" in answer.json()["results"][2]["error"]["message"]
+        assert 'trilitenet_rejects_total{reason="too_much_memory"} 1.0' in client.get("/metrics").text
+
+
+def test_a_batch_for_which_there_was_no_time_is_refused_as_a_whole(
+    make_app: MakeApp, backend: FakeBackend, jpeg: bytes
+) -> None:
+    app = make_app(deadline=0.2)
+    with TestClient(app) as client:
+        backend.gate.clear()
+        late = client.post("/v1/predict/batch", files=[("images", ("a", jpeg))] * 2)
+        mixed = client.post("/v1/predict/batch", files=[("images", ("a", jpeg)), ("images", ("b", b"no image"))])
+        backend.gate.set()
+        text = client.get("/metrics").text
+    assert late.status_code == 503
+    assert late.json()["error"]["code"] == "deadline"
+    assert int(late.headers["retry-after"]) >= 1
+    assert [result["status"] for result in mixed.json()["results"]] == [503, 415]
+    assert 'trilitenet_rejects_total{reason="deadline"} 2.0' in text
+    assert 'trilitenet_rejects_total{reason="unsupported_type"} 1.0' in text
+
+
+@pytest.mark.parametrize("path", ["/v1/predict", "/v1/predict/batch", "/v2/models/tiny/infer"])
+def test_a_refused_image_is_not_charged_to_the_next(
+    client: TestClient, app: Application, monkeypatch: pytest.MonkeyPatch, jpeg: bytes, path: str
+) -> None:
+    skipped: list[int] = []
+    monkeypatch.setattr(app.service.admission, "skip", lambda: skipped.append(1))
+    files = {"images": ("a", jpeg[:-30])}
+    client.post(path, files=files) if path.startswith("/v1") else client.post(path, content=b"no JSON")
+    assert skipped == [1]
+
+
+def test_a_slash_too_many_leads_nowhere(client: TestClient) -> None:
+    assert client.get("/v1/models/", follow_redirects=False).status_code == 404

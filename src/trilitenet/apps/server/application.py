@@ -73,6 +73,7 @@ def _routes(service: Service) -> FastAPI:
         description=_DESCRIPTION,
         docs_url=None,
         redoc_url=None,
+        redirect_slashes=False,  # it would lead from https to http behind a proxy
         lifespan=lifespan,
     )
     api.include_router(rest_router(service))

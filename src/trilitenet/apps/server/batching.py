@@ -78,11 +78,16 @@ class Admission:
         with self._lock:
             self.taken -= count
 
+    def skip(self) -> None:
+        """Learn nothing from the time until now: it went to an image that was refused, or whose client has gone."""
+        with self._lock:
+            self._since = self._clock()
+
     def observe(self, count: int) -> None:
         """Learn from ``count`` images that came through now how long one takes, as a moving average.
 
-        The time runs from the last ones that came through, or from when the places were all free: so it holds all
-        that an image costs, and what else the machine does meanwhile.
+        The time runs from the last ones that came through or were skipped, or from when the places were all free: so
+        it holds all that an image costs, and what else the machine does meanwhile.
         """
         with self._lock:
             if self.taken == 0:  # the first run, before any request

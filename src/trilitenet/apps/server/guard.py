@@ -15,7 +15,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from trilitenet.apps.server.intake import too_large
+from trilitenet.apps.server.intake import Reservation, too_large
 from trilitenet.apps.server.pages import PAGE_PATHS
 from trilitenet.apps.server.problems import ProblemError, problem_response
 from trilitenet.apps.server.service import Service
@@ -41,6 +41,9 @@ _REQUEST_ID: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _LINGER: Final = 1.0
 """Seconds that the rest of a refused body is read and dropped, so that the client can read its answer."""
 
+_SMALL: Final = 2**16
+"""Bytes of an answer that are sent at once, whether somebody reads them or not."""
+
 
 class Guard:
     """ASGI middleware around the whole application.
@@ -65,7 +68,7 @@ class Guard:
 
     async def _request(self, scope: Scope, receive: Receive, send: Send) -> None:
         exchange = _Exchange(scope, receive, send, self._service)
-        scope.setdefault("state", {})["request_id"] = exchange.identifier
+        scope.setdefault("state", {}).update(request_id=exchange.identifier, reservation=exchange.reservation)
         try:
             try:
                 self._check(scope, exchange.headers)
@@ -81,6 +84,7 @@ class Guard:
             if not exchange.started:
                 raise
         finally:
+            exchange.reservation.keep(0)
             exchange.log()
 
     def _check(self, scope: Scope, headers: Headers) -> None:
@@ -120,6 +124,7 @@ class _Exchange:
         given = self.headers.get("x-request-id", "")
         self.identifier = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
         self.started = False
+        self.reservation = Reservation(service.memory)
         self._scope = scope
         self._receive = receive
         self._send = send
@@ -154,7 +159,7 @@ class _Exchange:
         return message
 
     async def send(self, message: Message) -> None:
-        """Send a piece of the answer, with the headers that every answer has."""
+        """Send a piece of the answer, with the headers that every answer has; memory is held until it is read."""
         if message["type"] == "http.response.start":
             self.started = True
             self._status = message["status"]
@@ -164,10 +169,14 @@ class _Exchange:
             headers["x-request-id"] = self.identifier
             if self._service.draining or not self._body_complete:
                 headers["connection"] = "close"
-        elif message["type"] == "http.response.body" and not message.get("more_body") and not self._body_complete:
-            await self._send({**message, "more_body": True})
-            await self.drop_body()
-            message = {"type": "http.response.body", "body": b"", "more_body": False}
+        elif message["type"] == "http.response.body" and not message.get("more_body"):
+            size = len(message.get("body", b""))
+            self.reservation.keep(size)
+            if size > _SMALL or not self._body_complete:
+                await self._send({**message, "more_body": True})
+                await self.drop_body()
+                # The server takes this only when the client has read nearly all that was sent before.
+                message = {"type": "http.response.body", "body": b"", "more_body": False}
         await self._send(message)
 
     async def drop_body(self) -> None:

@@ -13,6 +13,7 @@ import binascii
 import json
 import struct
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -22,11 +23,11 @@ from starlette.responses import JSONResponse, Response
 
 from trilitenet import __version__
 from trilitenet.apps.server import openapi
-from trilitenet.apps.server.intake import BYTES_PER_PIXEL, Header, Reservation, check_header, read_header
+from trilitenet.apps.server.intake import Header, check_header, read_header
 from trilitenet.apps.server.problems import ProblemError
 from trilitenet.apps.server.rest import read_request, until_vanished
-from trilitenet.apps.server.service import Encoded, Outcome, Service
-from trilitenet.apps.server.settings import Settings
+from trilitenet.apps.server.service import Encoded, Outcome, Service, in_time
+from trilitenet.apps.server.settings import BYTES_PER_PIXEL, Settings
 from trilitenet.config import ModelCard
 from trilitenet.structures import Perception
 
@@ -34,6 +35,12 @@ __all__ = ["protocol_router"]
 
 _HEADER_LENGTH: Final = "inference-header-content-length"
 _VERSION: Final = "1"
+
+_MAX_VALUES: Final = 1_500_000
+"""Values in the JSON of a request: parsing more would hold Python's lock for too long. 640 x 480 pixels fit."""
+
+_MAX_MASK_PIXELS: Final = 4_000_000
+"""Pixels of all images of a request whose masks are wanted as JSON."""
 
 
 class _Query(NamedTuple):
@@ -78,15 +85,21 @@ def protocol_router(service: Service) -> APIRouter:
     @router.post("/v2/models/{model}/versions/{version}/infer", **openapi.INFER)
     async def infer(request: Request, model: str, version: str = _VERSION) -> Response:
         _check_model(service, model, version)
-        with Reservation(service.memory) as reservation:
-            body = await read_request(request, service, reservation)
-            split = _json_length(request.headers.get(_HEADER_LENGTH), len(body))
-            reservation.take(8 * split)  # numbers in JSON grow when they are parsed
+        reservation = request.scope["state"]["reservation"]
+        body = await read_request(request, service, reservation)
+        split = _json_length(request.headers.get(_HEADER_LENGTH), len(body))
+        reservation.take(_json_memory(body, split))
+
+        async def work(deadline: float) -> Response:
             query = await service.in_pool(_parse, body, split, names, service.settings)
-            reservation.take(len(query.images) * query.size[0] * query.size[1] * BYTES_PER_PIXEL)
-            with service.admit(len(query.images)) as deadline:
-                perceptions = await until_vanished(request, service.see_all(query.images, deadline, _perception))
-            return await service.in_pool(_answer, service.name, query, perceptions)
+            count = len(query.images)
+            reservation.take(count * query.size[0] * query.size[1] * BYTES_PER_PIXEL)
+            with service.admit(count - 1) if count > 1 else nullcontext():
+                perceptions = await service.see_all(query.images, deadline, _perception)
+                return await service.in_pool(_answer, service.name, query, perceptions)
+
+        with service.admit(1) as deadline:  # how many images there are is known only when the request is parsed
+            return await until_vanished(request, in_time(work(deadline), deadline))
 
     return router
 
@@ -124,9 +137,24 @@ def _metadata(name: str, names: Sequence[str]) -> dict[str, Any]:
 def _json_length(header: str | None, length: int) -> int:
     if header is None:
         return length
-    if not header.isdecimal() or int(header[:20]) > length:
+    if not (header.isascii() and header.isdecimal() and len(header) <= 20) or int(header) > length:
         raise _bad(f"{_HEADER_LENGTH} must be at most the length of the body, {length}")
     return int(header)
+
+
+def _json_memory(body: bytes, split: int) -> int:
+    """Return the most bytes that the first ``split`` bytes of a body can take once they are parsed as JSON.
+
+    Raises:
+        ProblemError: 413 if they hold too many values.
+    """
+    plain = body.count(b",", 0, split)
+    nested = body.count(b"[", 0, split) + body.count(b"{", 0, split)
+    if plain + nested > _MAX_VALUES:
+        raise ProblemError(
+            413, "too_many_values", f"the JSON holds more than {_MAX_VALUES:,} values: send the tensor in binary form"
+        )
+    return 8 * split + 64 * plain + 256 * nested  # text of four bytes a letter, twice; a number each; a list each
 
 
 def _parse(body: bytes, split: int, names: Sequence[str], settings: Settings) -> _Query:
@@ -163,6 +191,13 @@ def _parse(body: bytes, split: int, names: Sequence[str], settings: Settings) ->
         images, size = _files(tensor, shape, body[split:], settings)
     else:
         raise _bad("the datatype of image must be UINT8 (pixels) or BYTES (encoded images)")
+    as_json = any(not binary for output, binary in outputs.items() if output != "boxes")
+    if as_json and len(images) * size[0] * size[1] > _MAX_MASK_PIXELS:
+        raise ProblemError(
+            413,
+            "too_many_values",
+            f"masks of more than {_MAX_MASK_PIXELS:,} pixels are not sent as JSON: ask for binary_data, or for boxes",
+        )
     return _Query(identifier, images, size, outputs)
 
 
@@ -214,8 +249,12 @@ def _pixels(
     data = _binary(tensor, rest)
     try:
         if data is None:
-            values = np.asarray(tensor.get("data"))
-            if values.dtype.kind not in "iu" or (values.size and not (values.min() >= 0 and values.max() <= 255)):
+            # As objects: texts of several lengths would each take as much as the longest.
+            values = np.asarray(tensor.get("data"), object)
+            kinds = set(map(type, values.flat))
+            if list in kinds:
+                raise ValueError
+            if kinds - {int} or (values.size and not (values.min() >= 0 and values.max() <= 255)):
                 raise _bad("data must hold whole numbers from 0 to 255")
             array = values.astype(np.uint8)
         else:
@@ -273,10 +312,11 @@ def _answer(name: str, query: _Query, perceptions: list[Perception]) -> Response
     """Write the response, with the binary tensors after the JSON."""
     if len({perception.size for perception in perceptions}) > 1:
         raise _bad("the images differ in size after their EXIF rotation; send them apart")
-    outputs: list[dict[str, Any]] = []
+    outputs: list[str] = []
     tail: list[bytes] = []
     for output, binary in query.outputs.items():
         array = _boxes(perceptions) if output == "boxes" else np.stack([_mask(p, output) for p in perceptions])
+        data = ""
         entry: dict[str, Any] = {
             "name": output,
             "datatype": "FP32" if output == "boxes" else "UINT8",
@@ -285,18 +325,31 @@ def _answer(name: str, query: _Query, perceptions: list[Perception]) -> Response
         if binary:
             tail.append(array.tobytes())
             entry["parameters"] = {"binary_data_size": len(tail[-1])}
-        else:
+        elif output == "boxes":
             entry["data"] = array.ravel().tolist()
-        outputs.append(entry)
-    mapping: dict[str, Any] = {"model_name": name, "model_version": _VERSION, "outputs": outputs}
+        else:
+            data = _digits(array)
+        outputs.append(f'{_compact(entry)[:-1]},"data":[{data}]}}' if data else _compact(entry))
+    mapping: dict[str, Any] = {"model_name": name, "model_version": _VERSION}
     if query.identifier is not None:
         mapping["id"] = query.identifier
-    head = json.dumps(mapping, separators=(",", ":")).encode()
+    head = f'{_compact(mapping)[:-1]},"outputs":[{",".join(outputs)}]}}'.encode()
     if not tail:
         return Response(head, media_type="application/json")
     return Response(
         b"".join([head, *tail]), media_type="application/octet-stream", headers={_HEADER_LENGTH: str(len(head))}
     )
+
+
+def _compact(mapping: dict[str, Any]) -> str:
+    return json.dumps(mapping, separators=(",", ":"))
+
+
+def _digits(mask: NDArray[Any]) -> str:
+    """Write zeros and ones with commas between: a mask as numbers of Python would stop everything else meanwhile."""
+    text = np.full(2 * mask.size - 1, ord(","), np.uint8)
+    text[::2] = mask.ravel() + np.uint8(ord("0"))
+    return text.tobytes().decode("ascii")
 
 
 def _boxes(perceptions: Sequence[Perception]) -> NDArray[np.float32]:

@@ -23,10 +23,10 @@ from trilitenet.apps.server.settings import Settings
 from trilitenet.errors import InputError
 from trilitenet.processing.images import read_image
 
-__all__ = ["BYTES_PER_PIXEL", "Header", "MemoryBudget", "Reservation", "check_header", "decode", "read_header"]
+__all__ = ["Header", "MemoryBudget", "Reservation", "check_header", "decode", "read_header"]
 
-BYTES_PER_PIXEL: Final = 10
-"""Memory that one pixel of an accepted image may take while it is worked on: decoder, RGB copy, masks, drawing."""
+_MAX_SEGMENTS: Final = 10_000
+"""Segments of a JPEG, of which its header, metadata and scans are made; each costs a step of Python."""
 
 Kind = Literal["JPEG", "PNG", "WEBP"]
 
@@ -112,7 +112,7 @@ def decode(data: bytes, header: Header) -> NDArray[np.uint8]:
 def _jpeg(data: bytes) -> Header:
     """Walk the marker segments up to the frame header, then count the scans."""
     position = 2
-    while True:
+    for _ in range(_MAX_SEGMENTS):
         if data[position] != 0xFF:
             raise ProblemError(422, "broken_image", "the JPEG image has a broken header")
         while data[position] == 0xFF:
@@ -126,11 +126,48 @@ def _jpeg(data: bytes) -> Header:
         (length,) = struct.unpack_from(">H", data, position)
         if 0xC0 <= marker <= 0xCF and marker not in {0xC4, 0xC8, 0xCC}:
             height, width = struct.unpack_from(">HH", data, position + 3)
-            # Entropy-coded bytes never hold this pair, because 0xFF is stuffed there.
-            return Header("JPEG", width, height, max(1, data.count(b"\xff\xda", position)))
+            return Header("JPEG", width, height, max(1, _scans(data, position + length)))
         if length < 2:
             raise ProblemError(422, "broken_image", "the JPEG image has a broken header")
         position += length
+    raise _too_many_segments()
+
+
+def _scans(data: bytes, position: int) -> int:
+    """Count the scans from a position after the frame header to the end mark, as a decoder meets them.
+
+    What a segment holds (a thumbnail) and what follows the end mark (a film) is no part of the picture.
+    """
+    scans = 0
+    array = np.frombuffer(data, np.uint8)
+    for _ in range(_MAX_SEGMENTS):
+        position = _next_marker(array, position)
+        if position >= len(data) or data[position] == 0xD9:
+            return scans
+        scans += data[position] == 0xDA
+        has_length = data[position] >= 0xC0 and data[position] != 0xD8
+        position += 1
+        if has_length:
+            position += max(2, int.from_bytes(data[position : position + 2], "big"))
+    raise _too_many_segments()
+
+
+def _next_marker(data: NDArray[np.uint8], position: int) -> int:
+    """Return where the next marker's second byte is, or the length of the data."""
+    size = 4096
+    while position < len(data) - 1:
+        first, second = data[position : position + size + 1][:-1], data[position + 1 : position + size + 1]
+        # Inside a scan 0xFF is stuffed with a zero, or begins a restart; it may fill the space between segments.
+        found = (first == 0xFF) & (second != 0x00) & (second & 0xF8 != 0xD0) & (second != 0xFF)
+        if found.any():
+            return position + int(found.argmax()) + 1
+        position += size
+        size = min(2 * size, 2**20)
+    return len(data)
+
+
+def _too_many_segments() -> ProblemError:
+    return ProblemError(413, "too_many_segments", f"the JPEG image has more than {_MAX_SEGMENTS:,} segments")
 
 
 def _png(data: bytes) -> Header:
@@ -188,22 +225,38 @@ class MemoryBudget:
 
 @dataclasses.dataclass
 class Reservation:
-    """What one request holds of a `MemoryBudget`; all of it is given back at the end of a ``with`` block."""
+    """What one request and its answer hold of a `MemoryBudget`; the end of a ``with`` block gives it all back."""
 
     budget: MemoryBudget
     held: int = 0
 
     def take(self, count: int) -> None:
-        """Hold ``count`` bytes more, or raise `BusyError`."""
+        """Hold ``count`` bytes more.
+
+        Raises:
+            ProblemError: 413 if the request takes more than there is for all.
+            BusyError: If there are not as many left now.
+        """
+        if self.held + count > self.budget.limit:
+            raise ProblemError(
+                413,
+                "too_much_memory",
+                f"the request takes more than {self.budget.limit:,} bytes of memory: send fewer or smaller images",
+            )
         self.budget.take(count)
         self.held += count
+
+    def keep(self, count: int) -> None:
+        """Give back all but ``count`` bytes."""
+        kept = min(self.held, count)
+        self.budget.give(self.held - kept)
+        self.held = kept
 
     def __enter__(self) -> Reservation:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        self.budget.give(self.held)
-        self.held = 0
+        self.keep(0)
 
 
 async def read_body(chunks: AsyncIterator[bytes], reservation: Reservation, settings: Settings) -> bytes:

@@ -19,16 +19,11 @@ from starlette.responses import JSONResponse, Response
 
 from trilitenet import __version__
 from trilitenet.apps.server import openapi
-from trilitenet.apps.server.intake import (
-    BYTES_PER_PIXEL,
-    Reservation,
-    check_header,
-    read_body,
-    read_header,
-)
+from trilitenet.apps.server.intake import Reservation, check_header, read_body, read_header
 from trilitenet.apps.server.multipart import split_form
-from trilitenet.apps.server.problems import ProblemError
+from trilitenet.apps.server.problems import BusyError, ProblemError
 from trilitenet.apps.server.service import Encoded, Outcome, Service
+from trilitenet.apps.server.settings import BYTES_PER_PIXEL
 from trilitenet.processing.drawing import DRIVABLE_COLOUR, LANE_COLOUR
 from trilitenet.structures import Perception
 
@@ -55,27 +50,30 @@ def rest_router(service: Service) -> APIRouter:
         confidence: Confidence = None,
     ) -> Response:
         """See one image: vehicles, drivable area and lane markings."""
-        with Reservation(service.memory) as reservation:
-            image = await _one_image(request, service, reservation)
-            finish = _finisher(output, request, service)
-            with service.admit(1) as deadline:
-                work = service.see(image, deadline, finish, confidence, keep_image=output == "overlay")
-                return await until_vanished(request, work)
+        image = await _one_image(request, service, request.scope["state"]["reservation"])
+        finish = _finisher(output, request, service)
+        with service.admit(1) as deadline:
+            work = service.see(image, deadline, finish, confidence, keep_image=output == "overlay")
+            return await until_vanished(request, work)
 
     @router.post("/v1/predict/batch", tags=["prediction"], **openapi.PREDICT_BATCH)
     async def predict_batch(request: Request, confidence: Confidence = None) -> Response:
         """See several images. One that is broken does not spoil the others: each has a status of its own."""
-        with Reservation(service.memory) as reservation:
-            images = await _all_images(request, service, reservation)
-            finish = functools.partial(_to_mapping, service=service)
-            with service.admit(len(images)) as deadline:
-                jobs = [
-                    _settle(service.see(i, deadline, finish, confidence)) if isinstance(i, Encoded) else _as_is(i)
-                    for i in images
-                ]
-                results = await until_vanished(request, asyncio.gather(*jobs))
-            body = {**_about(request, service), "results": results}
-            return Response(await service.in_pool(_to_json, body), media_type="application/json")
+        images = await _all_images(request, service, request.scope["state"]["reservation"])
+        finish = functools.partial(_to_mapping, service=service)
+        with service.admit(len(images)) as deadline:
+            jobs = [
+                _settle(service.see(i, deadline, finish, confidence), service) if isinstance(i, Encoded) else _as_is(i)
+                for i in images
+            ]
+            results = await until_vanished(request, asyncio.gather(*jobs))
+        if all(result["status"] == 503 for result in results):
+            raise BusyError(**{name: results[0]["error"][name] for name in ("code", "message")})
+        for result in results:
+            if result["status"] != 200:
+                service.metrics.reject(result["error"]["code"])
+        body = {**_about(request, service), "results": results}
+        return Response(await service.in_pool(_to_json, body), media_type="application/json")
 
     @router.get("/v1/models", tags=["model"], **openapi.MODELS)
     async def models() -> Response:
@@ -241,10 +239,12 @@ def _encode(pixels: NDArray[np.uint8], kind: str) -> bytes:
     return buffer.getvalue()
 
 
-async def _settle(work: Coroutine[Any, Any, dict[str, Any]]) -> dict[str, Any]:
+async def _settle(work: Coroutine[Any, Any, dict[str, Any]], service: Service) -> dict[str, Any]:
     try:
         return await work
     except ProblemError as problem:
+        if problem.status != 503:
+            service.admission.skip()
         return _refusal(problem)
 
 

@@ -13,7 +13,7 @@ import io
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, Final, TypeVar
@@ -32,7 +32,7 @@ from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.structures import Perception, RawOutputs
 
-__all__ = ["Encoded", "Outcome", "Service"]
+__all__ = ["Encoded", "Outcome", "Service", "in_time"]
 
 logger = logging.getLogger(__name__)
 _T = TypeVar("_T")
@@ -137,6 +137,11 @@ class Service:
         self.admission.enter(count)
         try:
             yield time.monotonic() + self.settings.deadline
+        except BusyError:  # it waited for its turn: those ahead took the time
+            raise
+        except BaseException:
+            self.admission.skip()
+            raise
         finally:
             self.admission.leave(count)
 
@@ -176,12 +181,7 @@ class Service:
         if confidence is not None:
             thresholds = dataclasses.replace(predictor.thresholds, confidence=confidence)
             predictor = Predictor(predictor.backend, thresholds, long_side=predictor.long_side)
-        try:
-            return await asyncio.wait_for(
-                self._stages(image, deadline, finish, predictor, keep_image), timeout=deadline - time.monotonic()
-            )
-        except asyncio.TimeoutError:
-            raise _too_late() from None
+        return await in_time(self._stages(image, deadline, finish, predictor, keep_image), deadline)
 
     async def see_all(
         self,
@@ -254,6 +254,18 @@ class Service:
     def _observe_batch(self, size: int) -> None:
         self.metrics.batch(size)
         self.admission.observe(size)
+
+
+async def in_time(work: Awaitable[_T], deadline: float) -> _T:
+    """Await work until a deadline on `time.monotonic`; then it is cancelled.
+
+    Raises:
+        BusyError: If it is not done by then.
+    """
+    try:
+        return await asyncio.wait_for(work, deadline - time.monotonic())
+    except asyncio.TimeoutError:
+        raise _too_late() from None
 
 
 def _too_late() -> BusyError:

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from typing import Final
 
 from trilitenet.errors import ConfigError
 from trilitenet.processing.cores import usable_cores
 
-__all__ = ["Settings"]
+__all__ = ["BYTES_PER_PIXEL", "Settings"]
+
+BYTES_PER_PIXEL: Final = 10
+"""Memory that one pixel of an accepted image may take while it is worked on: decoder, RGB copy, masks, drawing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,8 +67,14 @@ class Settings:
             lowest = 0 if field.name in {"batch_delay", "drain", "threads"} else 1
             if field.type == "int" and value < lowest:
                 raise ConfigError(f"{field.name} must be at least {lowest}, got {value}")
-            if field.type == "float" and not (value > 0 or (lowest == 0 and value == 0)):
-                raise ConfigError(f"{field.name} must be positive, got {value}")
+            if field.type == "float" and not (0 < value < math.inf or (lowest == 0 and value == 0)):
+                raise ConfigError(f"{field.name} must be positive and finite, got {value}")
+        needed = 2 * self.max_body + BYTES_PER_PIXEL * self.max_pixels
+        if needed > self.memory:
+            raise ConfigError(
+                f"memory ({self.memory}) must be at least {needed}, for one image of max_pixels ({self.max_pixels}) "
+                f"and a body of max_body ({self.max_body})"
+            )
         if self.max_images > self.queue:
             raise ConfigError(f"max_images ({self.max_images}) must not exceed queue ({self.queue})")
         if self.token is not None and len(self.token) < 16:
