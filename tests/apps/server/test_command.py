@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import socket
 import sys
 from collections.abc import Iterator
@@ -102,3 +103,39 @@ def test_settings_must_fit_each_other() -> None:
 def test_every_limit_is_finite(name: str, value: float) -> None:
     with pytest.raises(ConfigError, match=f"{name} must be positive and finite"):
         Settings(**{name: value})  # type: ignore[arg-type]
+
+
+def test_the_model_needs_no_option_name(started: list[Any]) -> None:
+    assert cli.main(["serve", "runs/my.onnx", "--port", "0", "--memory", "2000000000", "--max-connections", "7"]) == 0
+    (server,) = started
+    assert server.config.app.service.name == "my"
+    assert (_settings(server).memory, _settings(server).max_connections) == (2_000_000_000, 7)
+
+
+def test_connections_are_refused_until_the_service_is_ready(
+    started: list[Any], monkeypatch: pytest.MonkeyPatch, backend: FakeBackend
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    outcomes: list[type[BaseException]] = []
+
+    def load(model: str, **options: Any) -> Predictor:
+        with pytest.raises(ConnectionRefusedError) as caught:
+            socket.create_connection(("127.0.0.1", port), timeout=10)
+        outcomes.append(caught.type)
+        return Predictor(backend)
+
+    monkeypatch.setattr("trilitenet.commands.load.load", load)
+    command.serve(port=port)
+    assert outcomes == [ConnectionRefusedError]
+
+
+def test_a_port_that_is_taken_while_the_model_loads_is_told(
+    started: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(self: GuardedServer, sockets: list[socket.socket]) -> None:
+        raise OSError(errno.EADDRINUSE, "Address already in use")
+
+    monkeypatch.setattr(GuardedServer, "run", run)
+    with pytest.raises(ConfigError, match="cannot listen"):
+        command.serve(port=0)

@@ -14,18 +14,30 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
+from uvicorn.protocols.http.flow_control import FlowControl
 
 from tests.apps.server.conftest import FakeBackend, MakeApp, Running, encode, picture
 from trilitenet.apps.server.application import Application
-from trilitenet.apps.server.process import JsonFormatter
+from trilitenet.apps.server.process import GuardedProtocol, JsonFormatter
 
 Run = Callable[[Application], Running]
+_T = TypeVar("_T")
 
 
 def _connect(running: Running) -> socket.socket:
     return socket.create_connection(("127.0.0.1", running.port), timeout=60)
+
+
+def _wait(ask: Callable[[], _T]) -> _T:
+    """Ask until there is something."""
+    until = time.monotonic() + 20
+    while not (found := ask()):
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    return found
 
 
 def _read_all(connection: socket.socket) -> bytes:
@@ -76,6 +88,104 @@ def test_endless_headers_are_refused(app: Application, run_app: Run) -> None:
         except OSError:
             pass
         assert connection.recv(1000).startswith(b"HTTP/1.1 431")
+
+
+def test_long_headers_are_refused_also_when_they_are_there_at_once(app: Application, run_app: Run) -> None:
+    running = run_app(app)
+    with _connect(running) as connection:
+        connection.sendall(b"GET /healthz HTTP/1.1\r\nhost: x\r\nx: " + b"y" * 33_000 + b"\r\n\r\n")
+        answer = _read_all(connection)
+    assert answer.startswith(b"HTTP/1.1 431")
+    assert json.loads(answer.split(b"\r\n\r\n")[1])["error"]["code"] == "headers_too_long"
+    with _connect(running) as connection:
+        connection.sendall(b"GET /healthz HTTP/1.1\r\nhost: x\r\nx: " + b"y" * 32_000 + b"\r\n\r\n")
+        assert connection.recv(1000).startswith(b"HTTP/1.1 200")
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        b"nonsense\r\n\r\n",
+        b"POST /v1/predict HTTP/1.1\r\nhost: x\r\ntransfer-encoding: chunked\r\n\r\nno number\r\n",
+    ],
+)
+def test_what_is_no_http_is_refused_in_the_form_of_every_refusal(
+    app: Application, run_app: Run, request_: bytes
+) -> None:
+    with _connect(run_app(app)) as connection:
+        connection.sendall(request_)
+        answer = _read_all(connection)
+    assert answer.startswith(b"HTTP/1.1 400")
+    assert json.loads(answer.split(b"\r\n\r\n")[1])["error"]["code"] == "bad_request"
+
+
+@pytest.mark.parametrize("rest", [b"", b"x" * 70_000])
+def test_a_request_that_offers_another_protocol_keeps_its_body(
+    app: Application, run_app: Run, jpeg: bytes, rest: bytes
+) -> None:
+    body = jpeg + rest  # what follows the picture is ignored
+    head = (
+        b"POST /v1/predict HTTP/1.1\r\nhost: x\r\nconnection: Upgrade, HTTP2-Settings\r\nUpgrade: h2c\r\n"
+        b"http2-settings: AAMAAABkAAQAoAAAAAIAAAAA\r\ncontent-length: %d\r\n\r\n" % len(body)
+    )
+    with _connect(run_app(app)) as connection:
+        for pieces in ([head + body], [head, body]):
+            for piece in pieces:
+                connection.sendall(piece)
+            answer = http.client.HTTPResponse(connection)
+            answer.begin()
+            assert answer.status == 200
+            assert json.load(answer)["perception"]["size"] == {"height": 48, "width": 64}
+            assert not answer.will_close
+
+
+def test_an_offer_in_pieces_is_refused_before_its_body_is_taken_for_a_request(app: Application, run_app: Run) -> None:
+    running = run_app(app)
+    with _connect(running) as connection:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.sendall(b"POST /v1/predict HTTP/1.1\r\nhost: x\r\ncontent-length: 54\r\nconnection: upgrade\r\nupg")
+        (protocol,) = _wait(lambda: list(running.server.server_state.connections))
+        assert isinstance(protocol, GuardedProtocol)
+        _wait(lambda: protocol._header_bytes)
+        connection.sendall(b"rade: h2c\r\n\r\n")
+        answer = connection.recv(1000)
+        connection.sendall(b"GET /healthz HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n")
+        answer += _read_all(connection)
+    assert answer.startswith(b"HTTP/1.1 400")
+    assert answer.count(b"HTTP/1.1 ") == 1
+
+
+def test_an_offer_of_websockets_is_answered_as_ever(app: Application, run_app: Run) -> None:
+    with _connect(run_app(app)) as connection:
+        for _ in range(2):
+            connection.sendall(
+                b"GET /healthz HTTP/1.1\r\nhost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+                b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+            )
+            answer = http.client.HTTPResponse(connection)
+            answer.begin()
+            assert answer.status == 200
+            answer.read()
+
+
+def test_refused_connections_are_counted_and_logged(
+    make_app: MakeApp, run_app: Run, caplog: pytest.LogCaptureFixture
+) -> None:
+    app = make_app(max_connections=1, header_timeout=0.2)
+    running = run_app(app)
+    with caplog.at_level(logging.INFO, logger="trilitenet.server"), _connect(running) as first:
+        with _connect(running) as second:
+            assert b" 503 " in _read_all(second)
+        assert b" 408 " in _read_all(first)
+    text = app.service.metrics.text().decode()
+    for reason in ("too_many_connections", "headers_timeout"):
+        assert f'trilitenet_rejects_total{{reason="{reason}"}} 1.0' in text
+    assert "\ntrilitenet_connections " in text
+    refused = [record.__dict__ for record in caplog.records if record.message == "connection refused"]
+    assert [(entry["status"], entry["problem"]) for entry in refused] == [
+        (503, "too_many_connections"),
+        (408, "headers_timeout"),
+    ]
 
 
 def test_a_body_that_trickles_is_cut_off(make_app: MakeApp, run_app: Run) -> None:
@@ -170,6 +280,44 @@ def test_a_client_that_does_not_read_is_cut_off(make_app: MakeApp, run_app: Run)
         time.sleep(0.05)
     assert not running.server.server_state.connections
     connection.close()
+
+
+class _Transport:
+    """A transport whose client reads as a test says."""
+
+    def __init__(self) -> None:
+        self.unread = 1000
+        self.aborted = False
+
+    def get_write_buffer_size(self) -> int:
+        return self.unread
+
+    def abort(self) -> None:
+        self.aborted = True
+
+
+class _Loop:
+    """Calls later when a test says so."""
+
+    def __init__(self) -> None:
+        self.later: Callable[[], None] = lambda: None
+
+    def call_later(self, seconds: float, function: Callable[..., None], *arguments: object) -> None:
+        self.later = lambda: function(*arguments)
+
+
+def test_a_client_that_reads_slowly_is_not_cut_off() -> None:
+    protocol = GuardedProtocol.__new__(GuardedProtocol)
+    transport, loop = _Transport(), _Loop()
+    protocol.transport, protocol.loop = transport, loop  # type: ignore[assignment]
+    protocol.flow = FlowControl(transport)  # type: ignore[arg-type]
+    protocol.pause_writing()
+    for left in (900, 500, 499):
+        transport.unread = left
+        loop.later()
+        assert not transport.aborted
+    loop.later()
+    assert transport.aborted
 
 
 def test_a_full_queue_is_told_with_retry_after(
@@ -284,6 +432,19 @@ def test_sigterm_under_load_loses_no_accepted_request(jpeg: bytes) -> None:
     assert set(outcomes) <= {"200", "503"}, outcomes
     assert sum(outcomes.values()) == len(answered)
     assert process.returncode in {0, -signal.SIGTERM}
+
+
+def test_warnings_are_logged_in_json_and_no_content_of_images() -> None:
+    script = """
+import logging, warnings
+from trilitenet.apps.server.process import set_up_logs
+set_up_logs("DEBUG")
+warnings.warn("corrupt EXIF")
+logging.getLogger("PIL.TiffImagePlugin").debug("owner: secret")
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    (entry,) = [json.loads(line) for line in done.stderr.splitlines()]
+    assert "corrupt EXIF" in entry["message"]
 
 
 def test_log_lines_are_json_with_the_fields() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import os
 import socket
 import sys
@@ -14,8 +15,8 @@ __all__ = ["serve"]
 
 
 def serve(
-    *,
     model: str = "tiny",
+    *,
     host: str = "127.0.0.1",
     port: int = 8000,
     device: str = "auto",
@@ -29,6 +30,8 @@ def serve(
     deadline: float = 10.0,
     max_body: int = 20 * 2**20,
     max_pixels: int = 7680 * 4320,
+    memory: int = 2**30,
+    max_connections: int = 512,
     drain: float = 1.0,
     log_level: str = "info",
 ) -> None:
@@ -53,6 +56,8 @@ def serve(
         deadline: Seconds after which an accepted image that is not through gets 503.
         max_body: Bytes of one request.
         max_pixels: Pixels of one image.
+        memory: Bytes that bodies, images in work and answers of all requests may take together; beyond, 503.
+        max_connections: Open connections; one more gets 503.
         drain: Seconds that the service still accepts after it was told to stop.
         log_level: What is logged: debug, info, warning or error.
 
@@ -78,6 +83,8 @@ def serve(
         deadline=deadline,
         max_body=max_body,
         max_pixels=max_pixels,
+        memory=memory,
+        max_connections=max_connections,
         max_images=min(Settings.max_images, queue),
         drain=drain,
         token=_read_token(token_file),
@@ -93,20 +100,37 @@ def serve(
             settings = dataclasses.replace(
                 settings, max_batch=getattr(predictor.backend, "streams", settings.max_batch)
             )
-        build_server(create_app(predictor, Path(model).stem, settings)).run([listener])
+        try:
+            build_server(create_app(predictor, Path(model).stem, settings)).run([listener])
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+            raise _cannot_listen(host, port, error) from error  # somebody else has begun to listen meanwhile
 
 
 def _listen(host: str, port: int) -> socket.socket:
-    """Return a listening socket: a port that is taken is told before the model is loaded."""
-    if not 0 <= port <= 65535:  # create_server would leave its socket open
+    """Return a bound socket: a port that is taken is told before the model is loaded.
+
+    The server listens on it when it is ready; until then connections are refused, not kept waiting.
+    """
+    if not 0 <= port <= 65535:
         raise ConfigError(f"cannot listen on {host} port {port} (port must be 0 to 65535); choose with --port")
+    listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     try:
-        return socket.create_server(
-            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET, backlog=1024
-        )
+        if os.name == "posix":
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if listener.family == socket.AF_INET6:
+            listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        listener.bind((host, port))
     except OSError as error:
-        reason = (error.strerror or str(error)).partition(" (while attempting")[0]  # what Python adds is said below
-        raise ConfigError(f"cannot listen on {host} port {port} ({reason}); choose with --host and --port") from error
+        listener.close()
+        raise _cannot_listen(host, port, error) from error
+    return listener
+
+
+def _cannot_listen(host: str, port: int, error: OSError) -> ConfigError:
+    reason = error.strerror or str(error)
+    return ConfigError(f"cannot listen on {host} port {port} ({reason}); choose with --host and --port")
 
 
 def _read_token(file: Path | None) -> str | None:

@@ -159,7 +159,7 @@ class _Exchange:
         return message
 
     async def send(self, message: Message) -> None:
-        """Send a piece of the answer, with the headers that every answer has; memory is held until it is read."""
+        """Send a piece of the answer, with the headers that all have; a large one holds memory until it is read."""
         if message["type"] == "http.response.start":
             self.started = True
             self._status = message["status"]
@@ -171,7 +171,7 @@ class _Exchange:
                 headers["connection"] = "close"
         elif message["type"] == "http.response.body" and not message.get("more_body"):
             size = len(message.get("body", b""))
-            self.reservation.keep(size)
+            self.reservation.keep(size if size > _SMALL else 0)
             if size > _SMALL or not self._body_complete:
                 await self._send({**message, "more_body": True})
                 await self.drop_body()

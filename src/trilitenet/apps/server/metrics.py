@@ -50,7 +50,10 @@ class Metrics:
             "trilitenet_requests", "Requests answered.", ["route", "method", "status"], registry=self.registry
         )
         self._rejects = Counter(
-            "trilitenet_rejects", "Requests refused, by reason.", ["reason"], registry=self.registry
+            "trilitenet_rejects",
+            "Requests, images of batches and connections refused, by reason.",
+            ["reason"],
+            registry=self.registry,
         )
         self._vanished = Counter(
             "trilitenet_vanished", "Requests whose client went away before the answer.", registry=self.registry

@@ -7,6 +7,7 @@ import contextlib
 import ctypes
 import json
 import logging
+import re
 import socket
 import sys
 import time
@@ -18,6 +19,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.server import ServerState
 
 from trilitenet.apps.server.application import Application
+from trilitenet.apps.server.metrics import Metrics
 from trilitenet.apps.server.settings import Settings
 
 __all__ = ["GuardedProtocol", "GuardedServer", "JsonFormatter", "build_server", "keep_freed_memory", "set_up_logs"]
@@ -26,6 +28,9 @@ logger = logging.getLogger("trilitenet.server")
 
 _MAX_HEADERS: Final = 32 * 1024
 """Bytes of a request's first line and headers."""
+
+_UPGRADE: Final = re.compile(rb"\r\nupgrade(?=[ \t]*:)", re.IGNORECASE)
+"""The header that asks for another protocol, in the bytes of headers."""
 
 _LAST_CALL: Final = 1.0
 """Seconds that a connection without a request is given when the server stops, and a refused one to read why."""
@@ -44,10 +49,12 @@ class GuardedProtocol(HttpToolsProtocol):
     """HTTP/1.1 with limits on what a slow or greedy client can hold.
 
     uvicorn waits without end for a request's headers, takes headers of any length, and keeps a connection whose client
-    reads nothing. Here each has a limit.
+    reads nothing. Here each has a limit. Its parser drops the body of a request that offers another protocol, and takes
+    it for the next request. Here such an offer is passed over.
     """
 
     limits = Settings()
+    metrics: Metrics | None = None
 
     def __init__(
         self,
@@ -61,16 +68,19 @@ class GuardedProtocol(HttpToolsProtocol):
         self._stuck: asyncio.TimerHandle | None = None
         self._in_headers = True
         self._header_bytes = 0
+        self._parsed_bytes = 0
         self._refused = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Accept a connection, unless there are too many."""
         super().connection_made(transport)
         if len(self.connections) > 2 * self.limits.max_connections:
+            if self.metrics is not None:
+                self.metrics.reject("too_many_connections")
             transport.abort()  # too many even of those that are told so
             return
         if len(self.connections) > self.limits.max_connections:
-            self._refuse(503, "too many connections", "retry-after: 1\r\n")
+            self._refuse(503, "too_many_connections", "too many connections", "retry-after: 1\r\n")
             return
         raw: socket.socket | None = transport.get_extra_info("socket")
         if raw is not None and _TCP_USER_TIMEOUT is not None and raw.family in {socket.AF_INET, socket.AF_INET6}:
@@ -90,27 +100,64 @@ class GuardedProtocol(HttpToolsProtocol):
             return
         if self._in_headers:
             self._header_bytes += len(data)
+            end = data.find(b"\r\n\r\n")
+            head = data if end < 0 else data[:end]
+            if _UPGRADE.search(head):
+                data = _UPGRADE.sub(b"\r\nignored", head) + data[len(head) :]
         super().data_received(data)
         if self._in_headers and self._due is None and (self.cycle is None or self.cycle.response_complete):
             self._wait_for_headers()  # line breaks before a request begin no message, but end the idle time
         if self._in_headers and self._header_bytes > _MAX_HEADERS:
-            self._refuse(431, "the headers are too long")
+            self._refuse_headers()
+
+    def send_400_response(self, msg: str) -> None:
+        """Refuse what is no HTTP in the form of every refusal."""
+        self._refuse(400, "bad_request", msg.lower().rstrip("."))
 
     def on_message_begin(self) -> None:
         """A request begins: its headers are due."""
+        if self._refused:
+            return
+        self._parsed_bytes = 0
         self._wait_for_headers()
         super().on_message_begin()
 
+    def on_url(self, url: bytes) -> None:
+        """Take a piece of the address."""
+        self._parsed_bytes += len(url)
+        super().on_url(url)
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        """Take a header."""
+        self._parsed_bytes += len(name) + len(value)
+        super().on_header(name, value)
+
     def on_headers_complete(self) -> None:
         """The headers are there: the body is due."""
+        if self._refused:
+            return
+        if self._parsed_bytes > _MAX_HEADERS:
+            self._refuse_headers()
+            return
+        if self.parser.should_upgrade() and {b"content-length", b"transfer-encoding"} & dict(self.headers).keys():
+            # The header came in pieces, so it was not passed over: the parser is about to lose the body.
+            self._refuse(400, "bad_request", "a request with a body cannot change the protocol")
+            return
         self._cancel()
         self._in_headers = False
         # The application answers 408 in time; this only ends connections that trickle on after their answer.
         self._due = self.loop.call_later(self.limits.upload_timeout + 5.0, self.transport.close)
         super().on_headers_complete()
 
+    def on_body(self, body: bytes) -> None:
+        """Take a piece of the body."""
+        if not self._refused:
+            super().on_body(body)
+
     def on_message_complete(self) -> None:
         """The request is there."""
+        if self._refused:
+            return
         self._cancel()
         self._in_headers = True
         self._header_bytes = 0
@@ -127,15 +174,25 @@ class GuardedProtocol(HttpToolsProtocol):
             super().shutdown()
 
     def pause_writing(self) -> None:
-        """The client does not read: it has so long to do so."""
+        """The client does not read: it has so long to take something."""
         super().pause_writing()
-        self._stuck = self.loop.call_later(self.limits.send_timeout, self.transport.abort)
+        self._wait_for_reading()
 
     def resume_writing(self) -> None:
         """The client reads again."""
         if self._stuck is not None:
             self._stuck.cancel()
         super().resume_writing()
+
+    def _wait_for_reading(self) -> None:
+        left = self.transport.get_write_buffer_size()
+        self._stuck = self.loop.call_later(self.limits.send_timeout, self._check_reading, left)
+
+    def _check_reading(self, left: int) -> None:
+        if self.transport.get_write_buffer_size() < left:
+            self._wait_for_reading()
+        else:
+            self.transport.abort()
 
     def _wait_for_headers(self) -> None:
         self._cancel()
@@ -148,23 +205,32 @@ class GuardedProtocol(HttpToolsProtocol):
         if self.cycle is not None and not self._header_bytes:
             self.transport.close()  # between two requests
         else:
-            self._refuse(408, "the headers did not arrive in time")
+            self._refuse(408, "headers_timeout", "the headers did not arrive in time")
+
+    def _refuse_headers(self) -> None:
+        self._refuse(431, "headers_too_long", f"the headers are longer than {_MAX_HEADERS:,} bytes")
 
     def _cancel(self) -> None:
         if self._due is not None:
             self._due.cancel()
             self._due = None
 
-    def _refuse(self, status: int, message: str, headers: str = "") -> None:
+    def _refuse(self, status: int, code: str, message: str, headers: str = "") -> None:
         """Answer without the application, then close; what still arrives is dropped, so that the answer is not."""
         if self.transport.is_closing() or self._refused:
             return
         self._cancel()
-        if self.cycle is not None and not self.cycle.response_complete:
-            self.transport.close()  # an answer to an earlier request is on its way
-            return
         self._refused = True
-        body = json.dumps({"error": {"code": "connection", "message": message, "request_id": ""}})
+        if self.metrics is not None:
+            self.metrics.reject(code)
+        logger.info("connection refused", extra={"status": status, "problem": code})
+        if self.cycle is not None and not self.cycle.response_complete:
+            if self._in_headers or self.pipeline or self.cycle.response_started:
+                self.transport.close()  # an answer to an earlier request is on its way
+                return
+            self.cycle.disconnected = True  # its body is broken: the application need not wait for it
+            self.cycle.message_event.set()
+        body = json.dumps({"error": {"code": code, "message": message, "request_id": ""}})
         self.transport.write(
             f"HTTP/1.1 {status} Refused\r\n{headers}content-type: application/json\r\n"
             f"content-length: {len(body)}\r\nconnection: close\r\n\r\n{body}".encode()
@@ -231,8 +297,8 @@ def build_server(application: Application) -> GuardedServer:
     Args:
         application: What `create_app` made.
     """
-    settings = application.service.settings
-    protocol = type("Protocol", (GuardedProtocol,), {"limits": settings})
+    settings, metrics = application.service.settings, application.service.metrics
+    protocol = type("Protocol", (GuardedProtocol,), {"limits": settings, "metrics": metrics})
     config = Config(
         application,
         http=protocol,
@@ -246,7 +312,9 @@ def build_server(application: Application) -> GuardedServer:
         timeout_keep_alive=int(settings.keep_alive),
         timeout_graceful_shutdown=int(settings.shutdown_timeout),
     )
-    return GuardedServer(config, application)
+    server = GuardedServer(config, application)
+    metrics.gauge("connections", "Open connections.", lambda: len(server.server_state.connections))
+    return server
 
 
 class JsonFormatter(logging.Formatter):
@@ -269,10 +337,12 @@ class JsonFormatter(logging.Formatter):
 
 
 def set_up_logs(level: str = "INFO") -> None:
-    """Send all logs of the process to standard error, in JSON."""
+    """Send all logs and warnings of the process to standard error, in JSON."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter())
     logging.basicConfig(level=level, handlers=[handler], force=True)
+    logging.captureWarnings(True)
+    logging.getLogger("PIL").setLevel(max(logging.INFO, logging.getLogger().level))  # below, it logs what EXIF says
 
 
 def keep_freed_memory() -> bool:

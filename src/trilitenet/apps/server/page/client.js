@@ -11,6 +11,7 @@ export class ServiceError extends Error {
   constructor(status, message) {
     super(message);
     this.status = status;
+    this.wait = 1;
   }
 }
 
@@ -42,7 +43,10 @@ function sentence(text) {
 async function patiently(path, options) {
   for (let attempt = 0; ; attempt += 1) {
     try {
-      return await ask(path, options);
+      const answer = await ask(path, options);
+      const busy = answer.results?.find((result) => result.status === 503);
+      if (busy) throw new ServiceError(503, sentence(busy.error.message));
+      return answer;
     } catch (error) {
       if (error.status !== 503 || attempt === 4) throw error;
       await pause(1000 * error.wait, options.signal);
