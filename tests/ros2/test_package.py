@@ -152,6 +152,27 @@ def test_the_node_publishes_what_is_seen(messages: Any, monkeypatch: pytest.Monk
     message.encoding = "yuv422"
     node.subscriptions["image"](message)
     assert "yuv422" in node.messages[-1]
+    message.encoding, message.height = "bgr8", 0
+    node.subscriptions["image"](message)
+    assert "(0, 160, 3)" in node.messages[-1]
+
+
+def test_a_camera_file_of_another_shape_is_told_and_the_rest_published(
+    messages: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name, module in fakes.modules().items():
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.delitem(sys.modules, "trilitenet_ros.node", raising=False)
+    node_module = importlib.import_module("trilitenet_ros.node")
+    monkeypatch.setattr("trilitenet.load", lambda model, **options: Predictor(_Backend()), raising=False)
+    file = tmp_path / "camera.yaml"
+    file.write_text("image_width: 100\nimage_height: 100\nheight: 1.5\nfield_of_view: 60\n", encoding="utf-8")
+    monkeypatch.setattr(fakes.Node, "overrides", {"camera_file": str(file)})
+    node = node_module.PerceptionNode()
+    for count in (1, 2):
+        node.subscriptions["image"](_image("bgr8", np.zeros((96, 160, 3), np.uint8)))
+        assert len(node.publishers["~/detections"].published) == count
+    assert "the camera file is for 100x100 pixels" in "".join(node.messages)
 
 
 def test_the_package_is_described_once_and_alike() -> None:

@@ -44,7 +44,8 @@ class PerceptionNode(Node):
             backend=self.declare_parameter("backend", "auto").value,
             confidence=None if confidence < 0 else confidence,
         )
-        self._monitor = RoadMonitor(read_camera(camera_file) if camera_file else None)
+        self._camera = read_camera(camera_file) if camera_file else None
+        self._monitor = RoadMonitor(self._camera)
         self._start: float | None = None
         self._frame = 0
         self._detections = self.create_publisher(Detection2DArray, "~/detections", 1)
@@ -55,10 +56,12 @@ class PerceptionNode(Node):
 
     def _on_image(self, message: Image) -> None:
         try:
-            pixels = read_image(message)
-        except ValueError as error:
+            self._see(message)
+        except ValueError as error:  # a picture that cannot be seen, or that the camera file does not describe
             self.get_logger().error(str(error), throttle_duration_sec=5.0)
-            return
+
+    def _see(self, message: Image) -> None:
+        pixels = read_image(message)
         seconds = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
         self._start = seconds if self._start is None else self._start
         perception = dataclasses.replace(self._predictor(pixels), frame=self._frame, timestamp=seconds - self._start)
@@ -70,7 +73,12 @@ class PerceptionNode(Node):
                     self._masks[name].publish(fill_mask(mask, message.header, TYPES))
         header = copy.deepcopy(message.header)
         header.frame_id = self._vehicle_frame
-        for publisher, line in zip(self._lanes, self._monitor(perception).ego_lines, strict=True):
+        try:
+            lines = self._monitor(perception).ego_lines
+        except ValueError:
+            self._monitor = RoadMonitor(self._camera)  # this one has taken the picture's size for checked
+            raise
+        for publisher, line in zip(self._lanes, lines, strict=True):
             path = None if line is None else fill_path(line, header, TYPES)
             if path is not None:
                 publisher.publish(path)

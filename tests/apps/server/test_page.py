@@ -24,6 +24,7 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 from tests.apps.server.conftest import TOKEN, FakeBackend, Running, encode, picture
 from trilitenet.apps.server.application import create_app
+from trilitenet.apps.server.problems import BusyError
 from trilitenet.apps.server.settings import Settings
 from trilitenet.inference.predictor import Predictor
 
@@ -421,6 +422,26 @@ def test_a_clip_is_seen_in_chunks_with_progress(page: Page, server: Running, cli
     assert saved[5]["timestamp"] == 1.0
     page["save-clip"].click()
     assert page.downloaded("drive.webm").read_bytes()[:4] == b"\x1a\x45\xdf\xa3"
+
+
+def test_frames_for_which_there_was_no_time_are_asked_for_again(
+    page: Page, server: Running, clip: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    see = server.app.service.see
+    asked: list[int] = []
+
+    async def busy(*arguments: Any, **options: Any) -> Any:
+        asked.append(1)
+        if len(asked) == 3:
+            raise BusyError("deadline", "the image waited too long")
+        return await see(*arguments, **options)
+
+    monkeypatch.setattr(server.app.service, "see", busy)
+    page.choose(clip)
+    page.wait(lambda: page["progress-row"].is_displayed())
+    page.wait(lambda: not page["progress-row"].is_displayed() and page["player"].is_displayed())
+    assert not page["error"].is_displayed()
+    assert len(asked) == 8 + int(page["seek"].get_attribute("max")) + 1
 
 
 def test_a_clip_can_be_stopped(page: Page, clip: Path) -> None:
