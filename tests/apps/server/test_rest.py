@@ -9,9 +9,10 @@ import pytest
 from PIL import Image
 from starlette.testclient import TestClient
 
-from tests.apps.server.conftest import FakeBackend, MakeApp, encode, picture
+from tests.apps.server.conftest import TOKEN, FakeBackend, MakeApp, encode, picture
 from trilitenet.apps.server.application import Application, create_app
-from trilitenet.apps.server.openapi import BatchPrediction, Prediction
+from trilitenet.apps.server.guard import PUBLIC_PATHS
+from trilitenet.apps.server.openapi import BatchPrediction, Prediction, ProtocolErrorAnswer
 from trilitenet.config import ArtefactInfo
 from trilitenet.inference.predictor import Predictor
 from trilitenet.structures import Perception
@@ -256,3 +257,48 @@ def test_a_refused_image_is_not_charged_to_the_next(
 
 def test_a_slash_too_many_leads_nowhere(client: TestClient) -> None:
     assert client.get("/v1/models/", follow_redirects=False).status_code == 404
+
+
+def _documented(schema: dict[str, Any], path: str, method: str) -> set[str]:
+    return set(schema["paths"][path][method]["responses"])
+
+
+def test_the_schema_says_what_v2_answers(client: TestClient, backend: FakeBackend) -> None:
+    schema = client.get("/openapi.json").json()
+    infer = schema["paths"]["/v2/models/{model}/infer"]["post"]
+    assert set(infer["responses"]["200"]["content"]) == {"application/json", "application/octet-stream"}
+    assert "Retry-After" in infer["responses"]["503"]["headers"]
+    for path, operations in schema["paths"].items():
+        for operation in operations.values():
+            parameters = {(one["name"], one["in"]) for one in operation.get("parameters", ())}
+            assert ("version", "query") not in parameters
+            for status, response in operation["responses"].items():
+                text = json.dumps(response)
+                if status not in {"200", "503"}:
+                    assert ("ProtocolErrorAnswer" if path.startswith("/v2") else "/ErrorAnswer") in text
+    assert "HTTPValidationError" not in json.dumps(schema)
+    assert set(schema["paths"]["/metrics"]["get"]["responses"]["200"]["content"]) == {"text/plain"}
+    assert "503" in _documented(schema, "/v2/health/ready", "get")
+    assert {"404", "503"} <= _documented(schema, "/v2/models/{model}/versions/{version}/ready", "get")
+    path = "/v2/models/{model}/infer"
+    cross = client.post("/v2/models/tiny/infer", headers={"sec-fetch-site": "cross-site"})
+    unknown = client.post("/v2/models/other/infer")
+    backend.error = RuntimeError("no")
+    tensor = {"name": "image", "datatype": "UINT8", "shape": [1, 1, 1, 3], "data": [0, 0, 0]}
+    failed = client.post("/v2/models/tiny/infer", json={"inputs": [tensor]})
+    assert [answer.status_code for answer in (cross, unknown, failed)] == [403, 404, 500]
+    for answer in (cross, unknown, failed):
+        ProtocolErrorAnswer.model_validate(answer.json())
+        assert str(answer.status_code) in _documented(schema, path, "post")
+        assert answer.status_code == 404 or str(answer.status_code) in _documented(schema, "/v1/predict", "post")
+
+
+@pytest.mark.parametrize("token", [None, TOKEN])
+def test_the_schema_says_where_the_token_is_asked_for(make_app: MakeApp, token: str | None) -> None:
+    schema = make_app(token=token).api.openapi()
+    expected: list[dict[str, list[str]]] = [{"bearer": []}] if token else [{}, {"bearer": []}]
+    assert schema["components"]["securitySchemes"]["bearer"]["scheme"] == "bearer"
+    for path, operations in schema["paths"].items():
+        for method, operation in operations.items():
+            assert ("401" in _documented(schema, path, method)) == (path not in PUBLIC_PATHS)
+            assert operation.get("security") == (None if path in PUBLIC_PATHS else expected)

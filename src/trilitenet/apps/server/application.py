@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -12,7 +13,8 @@ from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
 from trilitenet import __version__
-from trilitenet.apps.server.guard import Guard
+from trilitenet.apps.server import openapi
+from trilitenet.apps.server.guard import PUBLIC_PATHS, Guard
 from trilitenet.apps.server.inference_protocol import protocol_router
 from trilitenet.apps.server.pages import pages_router
 from trilitenet.apps.server.problems import ProblemError, problem_response
@@ -26,7 +28,8 @@ __all__ = ["Application", "create_app"]
 _DESCRIPTION = """Driving perception of one small network: vehicles, drivable area and lane markings.
 
 Images are JPEG, PNG or WebP. Coordinates are pixels of the image as it is shown (EXIF rotation applied).
-Errors have one form, `{"error": {"code", "message", "request_id"}}`, and 503 comes with `Retry-After`.
+Errors have one form, `{"error": {"code", "message", "request_id"}}`, but below `/v2` that of the protocol,
+`{"error": message}`; 503 comes with `Retry-After`.
 """
 
 
@@ -59,6 +62,17 @@ def create_app(predictor: Predictor, name: str, settings: Settings | None = None
     return Application(Service(predictor, name, settings or Settings()))
 
 
+class _Api(FastAPI):
+    """FastAPI whose schema says that the guard asks for a token."""
+
+    token = False
+
+    def openapi(self) -> dict[str, Any]:
+        if self.openapi_schema is None:
+            openapi.add_token(super().openapi(), PUBLIC_PATHS, required=self.token)
+        return super().openapi()
+
+
 def _routes(service: Service) -> FastAPI:
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -67,7 +81,7 @@ def _routes(service: Service) -> FastAPI:
         await service.stop()
 
     # The interactive documentation of FastAPI loads scripts from elsewhere, so there is only the schema.
-    api = FastAPI(
+    api = _Api(
         title="TriLiteNet",
         version=__version__,
         description=_DESCRIPTION,
@@ -76,6 +90,7 @@ def _routes(service: Service) -> FastAPI:
         redirect_slashes=False,  # it would lead from https to http behind a proxy
         lifespan=lifespan,
     )
+    api.token = service.settings.token is not None
     api.include_router(rest_router(service))
     api.include_router(protocol_router(service))
     api.include_router(pages_router())

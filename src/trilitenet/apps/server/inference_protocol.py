@@ -65,25 +65,34 @@ def protocol_router(service: Service) -> APIRouter:
     async def live() -> Response:
         return JSONResponse({"live": service.alive}, status_code=200 if service.alive else 503)
 
-    @router.get("/v2/health/ready", **openapi.ANY)
+    @router.get("/v2/health/ready", **openapi.READY)
     async def ready() -> Response:
         return JSONResponse({"ready": service.ready}, status_code=200 if service.ready else 503)
 
-    @router.get("/v2/models/{model}", **openapi.ANY)
-    @router.get("/v2/models/{model}/versions/{version}", **openapi.ANY)
-    async def model_metadata(model: str, version: str = _VERSION) -> Response:
+    @router.get("/v2/models/{model}", **openapi.MODEL)
+    async def model_metadata(model: str) -> Response:
+        return await version_metadata(model, _VERSION)
+
+    @router.get("/v2/models/{model}/versions/{version}", **openapi.MODEL)
+    async def version_metadata(model: str, version: str) -> Response:
         _check_model(service, model, version)
         return JSONResponse(_metadata(service.name, names))
 
-    @router.get("/v2/models/{model}/ready", **openapi.ANY)
-    @router.get("/v2/models/{model}/versions/{version}/ready", **openapi.ANY)
-    async def model_ready(model: str, version: str = _VERSION) -> Response:
+    @router.get("/v2/models/{model}/ready", **openapi.MODEL_READY)
+    async def model_ready(model: str) -> Response:
+        return await version_ready(model, _VERSION)
+
+    @router.get("/v2/models/{model}/versions/{version}/ready", **openapi.MODEL_READY)
+    async def version_ready(model: str, version: str) -> Response:
         _check_model(service, model, version)
         return JSONResponse({"name": model, "ready": service.ready}, status_code=200 if service.ready else 503)
 
     @router.post("/v2/models/{model}/infer", **openapi.INFER)
+    async def infer(request: Request, model: str) -> Response:
+        return await version_infer(request, model, _VERSION)
+
     @router.post("/v2/models/{model}/versions/{version}/infer", **openapi.INFER)
-    async def infer(request: Request, model: str, version: str = _VERSION) -> Response:
+    async def version_infer(request: Request, model: str, version: str) -> Response:
         _check_model(service, model, version)
         reservation = request.scope["state"]["reservation"]
         body = await read_request(request, service, reservation)

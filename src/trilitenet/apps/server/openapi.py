@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
+from starlette.responses import PlainTextResponse
 
 __all__ = [
     "ANY",
     "INFER",
     "METRICS",
+    "MODEL",
     "MODELS",
+    "MODEL_READY",
     "PREDICT",
     "PREDICT_BATCH",
     "PROBE",
+    "READY",
     "BatchPrediction",
     "ErrorAnswer",
     "Prediction",
+    "ProtocolErrorAnswer",
+    "add_token",
 ]
 
 
@@ -88,6 +95,12 @@ class ErrorAnswer(_Strict):
     error: ErrorBody
 
 
+class ProtocolErrorAnswer(_Strict):
+    """A refusal in the form of the Open Inference Protocol."""
+
+    error: str
+
+
 class ErrorItem(_Strict):
     """Why one image was refused."""
 
@@ -132,17 +145,20 @@ def _error(code: str, message: str) -> dict[str, Any]:
     return {"model": ErrorAnswer, "content": {"application/json": {"example": {"error": body}}}}
 
 
+_UNAUTHORIZED: Final = ("unauthorized", "this service needs a bearer token")
+
+_RETRY: Final = {"Retry-After": {"description": "Seconds to wait.", "schema": {"type": "integer"}}}
+
 _REFUSALS: Final[dict[int | str, dict[str, Any]]] = {
     400: _error("empty", "the image is empty"),
-    401: _error("unauthorized", "this service needs a bearer token"),
+    401: _error(*_UNAUTHORIZED),
+    403: _error("cross_site", "another web site may not use this service through its visitors"),
     408: _error("upload_timeout", "the body did not arrive within 20 s"),
     413: _error("too_many_pixels", "the image has 60000 x 60000 pixels; send a smaller one"),
     415: _error("unsupported_type", "the bytes are not a JPEG, PNG or WebP image"),
     422: _error("broken_image", "the JPEG image is broken or truncated"),
-    503: {
-        **_error("queue_full", "all 64 places are taken; try again in 1 s"),
-        "headers": {"Retry-After": {"description": "Seconds to wait.", "schema": {"type": "integer"}}},
-    },
+    500: _error("internal", "the service failed on this request; its log says why"),
+    503: {**_error("queue_full", "all 64 places are taken; try again in 1 s"), "headers": _RETRY},
 }
 _FILE: Final = {"type": "string", "format": "binary"}
 
@@ -238,13 +254,53 @@ PROBE: Final[dict[str, Any]] = {
 }
 
 METRICS: Final[dict[str, Any]] = {
+    "response_class": PlainTextResponse,
     "responses": {200: {"content": {"text/plain": {"example": "trilitenet_ready 1.0\n"}}}},
 }
 
-ANY: Final[dict[str, Any]] = {"responses": {200: {"content": {"application/json": {"schema": {"type": "object"}}}}}}
+
+def _protocol_error(message: str) -> dict[str, Any]:
+    return {"model": ProtocolErrorAnswer, "content": {"application/json": {"example": {"error": message}}}}
+
+
+_OBJECT: Final = {"application/json": {"schema": {"type": "object"}}}
+
+_UNKNOWN: Final = _protocol_error("there is no model 'other'; this service has 'tiny'")
+
+ANY: Final[dict[str, Any]] = {"responses": {200: {"content": _OBJECT}}}
+
+MODEL: Final[dict[str, Any]] = {
+    "responses": {**ANY["responses"], 404: _UNKNOWN, "default": {**_UNKNOWN, "description": "Any other refusal."}}
+}
+
+READY: Final[dict[str, Any]] = {"responses": {**ANY["responses"], 503: {"description": "Not now.", "content": _OBJECT}}}
+
+MODEL_READY: Final[dict[str, Any]] = {"responses": {**MODEL["responses"], **READY["responses"]}}
 
 INFER: Final[dict[str, Any]] = {
-    **ANY,
+    "responses": {
+        200: {
+            "description": "The outputs, as JSON, or with binary tensors after it as the request's "
+            "binary_data parameters ask.",
+            "headers": {
+                "Inference-Header-Content-Length": {
+                    "description": "Bytes of the JSON before the binary tensors, if there are any.",
+                    "schema": {"type": "integer"},
+                }
+            },
+            "content": {**_OBJECT, "application/octet-stream": {"schema": _FILE}},
+        },
+        400: _protocol_error("shape must be a list of positive numbers"),
+        401: _protocol_error(_UNAUTHORIZED[1]),
+        403: _protocol_error("another web site may not use this service through its visitors"),
+        404: _UNKNOWN,
+        408: _protocol_error("the body did not arrive within 20 s"),
+        413: _protocol_error("at most 16 images are taken at once"),
+        415: _protocol_error("the bytes are not a JPEG, PNG or WebP image"),
+        422: _protocol_error("the JPEG image is broken or truncated"),
+        500: _protocol_error("the service failed on this request; its log says why"),
+        503: {**_protocol_error("all 64 places are taken; try again in 1 s"), "headers": _RETRY},
+    },
     "openapi_extra": {
         "requestBody": {
             "required": True,
@@ -262,3 +318,25 @@ INFER: Final[dict[str, Any]] = {
         }
     },
 }
+
+
+def add_token(schema: dict[str, Any], public: Container[str], *, required: bool) -> None:
+    """Say which requests take the bearer token, and that they get 401 without it.
+
+    Args:
+        schema: The OpenAPI document; changed in place.
+        public: Paths that need none.
+        required: Whether the service has a token; else any or none will do.
+    """
+    schema["components"]["securitySchemes"] = {"bearer": {"type": "http", "scheme": "bearer"}}
+    for path, operations in schema["paths"].items():
+        if path in public:
+            continue
+        v2 = path.startswith("/v2")
+        form = ProtocolErrorAnswer if v2 else ErrorAnswer
+        example = (_protocol_error(_UNAUTHORIZED[1]) if v2 else _error(*_UNAUTHORIZED))["content"]["application/json"]
+        content = {"schema": {"$ref": f"#/components/schemas/{form.__name__}"}, **example}
+        refusal = {"description": "Unauthorized", "content": {"application/json": content}}
+        for operation in operations.values():
+            operation["security"] = [{"bearer": []}] if required else [{}, {"bearer": []}]
+            operation["responses"].setdefault("401", refusal)

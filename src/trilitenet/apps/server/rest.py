@@ -96,7 +96,7 @@ def rest_router(service: Service) -> APIRouter:
 
     @router.get("/readyz", tags=["operation"], **openapi.PROBE)
     async def readyz() -> Response:
-        """Say whether new requests are welcome: 503 while starting and while shutting down."""
+        """Say whether new requests are welcome: 503 while shutting down."""
         return _probe(service.ready)
 
     @router.get("/metrics", tags=["operation"], **openapi.METRICS)
