@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import socket
 import sys
 from collections.abc import Iterator
@@ -35,6 +36,7 @@ def started(monkeypatch: pytest.MonkeyPatch, backend: FakeBackend) -> Iterator[l
     interval = sys.getswitchinterval()
     yield servers
     sys.setswitchinterval(interval)
+    gc.unfreeze()
 
 
 def _settings(server: Any) -> Settings:
@@ -48,6 +50,7 @@ def test_flags_become_settings(started: list[Any], backend: FakeBackend) -> None
     assert (_settings(server).queue, _settings(server).max_images, _settings(server).deadline) == (5, 5, 2.0)
     assert server.config.app.service.name == "my"
     assert backend.closed
+    assert gc.get_freeze_count() > 0
 
 
 def test_the_token_comes_from_a_file_or_the_environment(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import gc
 import os
 import socket
 import sys
@@ -100,6 +101,8 @@ def serve(
             settings = dataclasses.replace(
                 settings, max_batch=getattr(predictor.backend, "streams", settings.max_batch)
             )
+        gc.collect()
+        gc.freeze()  # what is there now stays: collections while serving need not go through it again and again
         try:
             build_server(create_app(predictor, Path(model).stem, settings)).run([listener])
         except OSError as error:
