@@ -94,8 +94,6 @@ class RoadMonitor:
     def _prepare(self, size: tuple[int, int]) -> None:
         if size == self._size:
             return
-        self._size = size
-        self._lines = None if self._still else LineTracker(size)
         if self._given is not None:
             wide, given = size[1] / size[0], self._given.size[1] / self._given.size[0]
             if abs(wide / given - 1) > 0.01:
@@ -109,6 +107,8 @@ class RoadMonitor:
             self._calibration = SelfCalibration(
                 size, field_of_view=field_of_view, lane_width=lane_width, still=self._still
             )
+        self._size = size
+        self._lines = None if self._still else LineTracker(size)
 
     def _trusted(self, lines: list[LaneLine]) -> tuple[Camera | None, CameraErrors, Literal["file", "lanes"] | None]:
         """Return the camera, how well it is known for this frame, and where it is from."""
