@@ -190,6 +190,15 @@ def test_openvino_with_synthetic_frames(artefacts: Artefacts, tmp_path: Path) ->
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("format_", "name"), [("onnx", "a.onnx"), ("torch", "a.pt2")])
+def test_doubled_masks_of_shipped_weights(tmp_path: Path, format_: Any, name: str) -> None:
+    done = export("tiny", format=format_, size="192x320", mask_scale=2, output=tmp_path / name)
+    assert done.parity is not None
+    assert done.parity.pixels is not None
+    assert done.parity.pixels > 0.9999
+
+
+@pytest.mark.slow
 def test_nothing_is_written_beyond_the_tolerance(
     artefacts: Artefacts, tmp_path: Path, frames: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

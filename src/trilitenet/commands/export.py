@@ -15,6 +15,7 @@ from typing import Any, Final, Literal, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.nn.functional import interpolate
 
 import trilitenet
 from trilitenet.commands.paths import text_paths
@@ -34,7 +35,7 @@ from trilitenet.errors import BackendError, ConfigError, InputError, OutputError
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.torch_backend import TorchBackend
-from trilitenet.models.trilitenet import TriLiteNet
+from trilitenet.models.trilitenet import NetworkOutputs, TriLiteNet
 from trilitenet.models.weights import load_network
 from trilitenet.processing.images import read_image
 from trilitenet.processing.letterbox import Letterbox
@@ -427,14 +428,28 @@ def _compare(network: TriLiteNet, backend: Backend, info: ArtefactInfo, checks: 
     reference: Backend = TorchBackend(network, "cpu")
     if info.nms:
         reference = _Suppressed(reference)
-    return compare(
-        reference.run,
-        backend.run,
-        checks,
-        TOLERANCES[info.precision],
-        masks=(thresholds.drivable, thresholds.lane),
-        confidence=thresholds.confidence,
-    )
+    doubling = network.register_forward_hook(_double_masks) if info.mask_scale == 2 else None
+    try:
+        return compare(
+            reference.run,
+            backend.run,
+            checks,
+            TOLERANCES[info.precision],
+            masks=(thresholds.drivable, thresholds.lane),
+            confidence=thresholds.confidence,
+        )
+    finally:
+        if doubling is not None:
+            doubling.remove()
+
+
+def _double_masks(_network: Any, _images: Any, outputs: NetworkOutputs) -> NetworkOutputs:
+    """Double the masks of a network's outputs as ``--mask-scale 2`` does: bilinear, before the decision."""
+
+    def double(mask: torch.Tensor | None) -> torch.Tensor | None:
+        return None if mask is None else interpolate(mask, scale_factor=2.0, mode="bilinear", align_corners=False)
+
+    return outputs._replace(drivable=double(outputs.drivable), lane=double(outputs.lane))
 
 
 class _Suppressed:

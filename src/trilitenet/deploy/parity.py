@@ -92,7 +92,7 @@ def compare(
 
     Args:
         reference: The network, giving probabilities.
-        artefact: The artefact, giving probabilities or decisions.
+        artefact: The artefact, giving probabilities or decisions, with masks of the same size.
         canvases: (H, W, 3) uint8 RGB each.
         tolerance: What the artefact may differ by.
         masks: Thresholds of drivable and lane.
@@ -106,9 +106,6 @@ def compare(
         for name, threshold in zip(("drivable", "lane"), masks, strict=True):
             wanted, mask = getattr(expected, name), getattr(got, name)
             if wanted is not None:
-                scale = mask.shape[1] // wanted.shape[1]
-                if scale > 1:  # an enlarged mask is compared by the mean of each block
-                    mask = _shrink(mask, scale)
                 limit = int(threshold * 255)
                 equal[name].append(float(np.mean((wanted[0] > limit) == (mask[0] > limit))))
         if expected.detection is not None and got.detection is not None:
@@ -124,13 +121,6 @@ def compare(
         box_error=float(np.mean(errors)) if errors else (0.0 if total else None),
         tolerance=tolerance,
     )
-
-
-def _shrink(mask: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
-    """Return the mean of blocks of an enlarged mask."""
-    batch, height, width = mask.shape
-    blocks = mask.reshape(batch, height // scale, scale, width // scale, scale)
-    return np.asarray(blocks.mean((2, 4)).round(), np.uint8)
 
 
 def _both(
