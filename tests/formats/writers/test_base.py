@@ -1,8 +1,13 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
+import importlib
 import json
+import signal
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,3 +76,67 @@ def test_output_that_is_a_file_is_an_error(tmp_path: Path, pictures: list[Percep
     (tmp_path / "taken").write_text("x")
     with pytest.raises(OutputError, match="taken"), open_writer("jsonl", tmp_path / "taken") as writer:
         writer.write(pictures[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "step"),
+    [("coco", "coco.encode_mask"), ("cvat", "cvat.cvat_mask"), ("openlabel", "base.dumps"), ("scalabel", "base.dumps")],
+)
+def test_ctrl_c_waits_until_a_result_is_whole(
+    name: str, step: str, tmp_path: Path, pictures: list[Perception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    handler = signal.getsignal(signal.SIGINT)
+    steps = 0
+
+    def write() -> None:
+        with open_writer(name, tmp_path) as writer:
+            writer.write(pictures[0])
+            module, _, function = f"trilitenet.formats.writers.{step}".rpartition(".")
+            plain = getattr(importlib.import_module(module), function)
+
+            def interrupted(value: Any) -> Any:
+                nonlocal steps
+                steps += 1
+                signal.raise_signal(signal.SIGINT)
+                return plain(value)
+
+            monkeypatch.setattr(f"{module}.{function}", interrupted)
+            writer.write(dataclasses.replace(pictures[0], source="again.jpg"))
+
+    with pytest.raises(KeyboardInterrupt):
+        write()
+    assert steps
+    assert signal.getsignal(signal.SIGINT) is handler
+    if name == "openlabel":
+        assert all(len(json.loads(path.read_text())["openlabel"]["frames"]) == 1 for path in tmp_path.glob("*.json"))
+    elif name == "cvat":
+        images = ElementTree.parse(tmp_path / "cvat-images.xml").findall("image")
+        assert [len(image) for image in images] == [4, 4]
+    elif name == "coco":
+        coco = json.loads((tmp_path / "coco.json").read_text())
+        assert [image["id"] for image in coco["images"]] == [1, 2]
+        assert [label["image_id"] for label in coco["annotations"]] == [1, 1, 1, 1, 2, 2, 2, 2]
+    else:
+        assert len(json.loads((tmp_path / "scalabel.json").read_text())["frames"]) == 2
+    assert not list(tmp_path.glob("*.part"))
+
+
+@pytest.mark.parametrize("name", ["coco", "json", "openlabel", "scalabel"])
+def test_a_failed_write_leaves_no_file_with_a_gap(
+    name: str, tmp_path: Path, video: list[Perception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(stream: JsonStream, value: Any, key: str | None = None) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def write() -> None:
+        with open_writer(name, tmp_path) as writer:
+            writer.write(video[0])
+            with monkeypatch.context() as patch:
+                patch.setattr(JsonStream, "add", full)
+                with pytest.raises(OSError, match="No space left"):
+                    writer.write(video[1])
+            writer.write(video[2])  # there is room again
+
+    with pytest.raises(OutputError, match="gap"):
+        write()
+    assert list(tmp_path.iterdir()) == []

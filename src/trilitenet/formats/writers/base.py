@@ -15,9 +15,11 @@ import abc
 import contextlib
 import importlib
 import json
+import signal
+import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePath
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import IO, TYPE_CHECKING, Any, ClassVar, Final
 
 from trilitenet.errors import ConfigError, OutputError, did_you_mean, writing
@@ -71,8 +73,8 @@ class Writer(abc.ABC):
         self._taken: set[str] = set()
         self._names: dict[str, str] = {}
         self._unnamed = 0
+        self._broken = False
 
-    @abc.abstractmethod
     def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
         """Write one image or frame.
 
@@ -82,12 +84,29 @@ class Writer(abc.ABC):
                 leaves it out.
 
         Raises:
-            OutputError: If a file exists and may not be replaced, or cannot be written.
+            OutputError: If a file exists and may not be replaced, or cannot be written, or an earlier one could not.
         """
+        if self._broken:
+            raise OutputError(f"{self.output}: a result could not be written, and what followed it would have a gap")
+        with _uninterrupted():
+            try:
+                self._write(perception, road)
+            except OSError as error:
+                self._broken = not isinstance(error, OutputError)
+                raise
+
+    def close(self) -> None:
+        """Finish every file, but none that a failed write may have left with a gap; a writer can be closed twice."""
+        with _uninterrupted():
+            self._close()
 
     @abc.abstractmethod
-    def close(self) -> None:
-        """Finish every file; a writer can be closed twice."""
+    def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+        """Write one image or frame; Ctrl-C waits for the end of it."""
+
+    @abc.abstractmethod
+    def _close(self) -> None:
+        """Finish every file that is not finished."""
 
     def __enter__(self) -> Self:
         return self
@@ -98,10 +117,11 @@ class Writer(abc.ABC):
         """Finish what there is; where that fails, leave no half file."""
         try:
             self.close()
-        except OSError:
+        except (OSError, ValueError):  # the latter from a file that an earlier failure has closed
             for path in set(self._begun) - set(self.files):
                 part_of(path).unlink(missing_ok=True)
-            raise
+            if not self._broken:  # told already
+                raise
 
     def create(self, name: str) -> Path:
         """Return the path of a file to write, in a folder that exists.
@@ -118,10 +138,13 @@ class Writer(abc.ABC):
         return path
 
     def finish(self, path: Path) -> None:
-        """Give a file that is whole its final name."""
-        part_of(path).replace(path)
+        """Give a file that is whole its final name; after a failed write it goes, for it may have a gap."""
+        if self._broken:
+            part_of(path).unlink(missing_ok=True)
+        else:
+            part_of(path).replace(path)
+            self.files.append(path)
         self._begun.remove(path)
-        self.files.append(path)
 
     def write_whole(self, path: Path, text: str) -> None:
         """Write a small file at once, so that it is whole or not there."""
@@ -196,6 +219,23 @@ def find_writer(format: str) -> type[Writer]:
     module, _, name = WRITERS[format].partition(":")
     writer: type[Writer] = getattr(importlib.import_module(module), name)
     return writer
+
+
+@contextlib.contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Let Ctrl-C, which may come between any two steps of Python, wait for the end of the block."""
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield  # no exception comes from Ctrl-C here
+        return
+    held: list[tuple[int, FrameType | None]] = []
+    signal.signal(signal.SIGINT, lambda number, frame: held.append((number, frame)))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if held:
+            before(*held[0])
 
 
 def part_of(path: Path) -> Path:

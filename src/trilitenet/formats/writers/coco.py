@@ -39,7 +39,7 @@ class CocoWriter(Writer):
         self._tasks: set[str] = set()
         self._annotations = 0
 
-    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+    def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
         """Write the annotations of one image."""
         height, width = perception.size
         self._class_names = perception.class_names
@@ -78,7 +78,7 @@ class CocoWriter(Writer):
                 },
             )
 
-    def close(self) -> None:
+    def _close(self) -> None:
         """Write the images and categories, and finish the file."""
         if self._stream is None:
             return

@@ -47,7 +47,7 @@ class CvatWriter(Writer):
         self._images: _ImagesFile | None = None
         self._video: _VideoFile | None = None
 
-    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+    def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
         """Write one image, or keep one frame of a video."""
         if perception.frame is None:
             self._close_video()
@@ -60,7 +60,7 @@ class CvatWriter(Writer):
             self._video = _VideoFile(self.create(f"{self.stem(perception)}.cvat-video.xml"), perception)
         self._video.add(perception, self.tolerance, road)
 
-    def close(self) -> None:
+    def _close(self) -> None:
         """Finish the files."""
         self._close_video()
         if self._images is not None:

@@ -46,22 +46,22 @@ class JsonWriter(Writer):
         self._video: JsonStream | None = None
         self._source: str | None = None
 
-    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+    def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
         """Write one picture or frame."""
         document = to_document(perception, road)
         if perception.frame is None:
-            self.close()
+            self._close()
             path = self.create(f"{self.stem(perception)}.json")
             self.write_whole(path, f"{dumps(document)}\n")
             return
         if self._video is None or self._source != perception.source:
-            self.close()
+            self._close()
             path = self.create(f"{self.stem(perception)}.json")
             head = f'{{"schema": "{SCHEMA_VERSION}", "source": {dumps(perception.source)}, "frames": ['
             self._video, self._source = JsonStream(path, head), perception.source
         self._video.add(document)
 
-    def close(self) -> None:
+    def _close(self) -> None:
         """Finish the file of the last video."""
         if self._video is not None:
             self._video.close("]}")
@@ -85,10 +85,10 @@ class JsonLinesWriter(Writer):
         self._handle: IO[str] = path.open("w", encoding="utf-8", buffering=1)
         self.files.append(path)
 
-    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+    def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
         """Write one line."""
         self._handle.write(f"{dumps(to_document(perception, road))}\n")
 
-    def close(self) -> None:
+    def _close(self) -> None:
         """Close the file."""
         self._handle.close()

@@ -42,16 +42,16 @@ class OpenLabelWriter(Writer):
         super().__init__(output, overwrite=overwrite)
         self._document: _Document | None = None
 
-    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+    def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
         """Write one picture or frame."""
         document = self._document
         if document is None or perception.frame is None or document.source != perception.source:
-            self.close()
+            self._close()
             path = self.create(f"{self.stem(perception)}.openlabel.json")
             self._document = document = _Document(path, perception.source)
         document.add(perception, road)
 
-    def close(self) -> None:
+    def _close(self) -> None:
         """Finish the file of the last picture or video."""
         if self._document is not None:
             self._document.close()

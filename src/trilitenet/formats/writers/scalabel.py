@@ -32,7 +32,7 @@ class ScalabelWriter(Writer):
         self._class_names: tuple[str, ...] = ()
         self._labels = 0
 
-    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+    def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
         """Write one frame."""
         assert self._stream is not None
         self._class_names = perception.class_names
@@ -49,7 +49,7 @@ class ScalabelWriter(Writer):
             frame["timestamp"] = round(perception.timestamp * 1000)  # milliseconds
         self._stream.add(frame)
 
-    def close(self) -> None:
+    def _close(self) -> None:
         """Write the categories, and finish the file."""
         if self._stream is None:
             return

@@ -118,14 +118,14 @@ class CsvWriter(Writer):
         self._frames.writeheader()
         self._boxes.writeheader()
 
-    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+    def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
         """Write the rows of one frame."""
         self._frames.writerow(frame_row(perception, road))
         where = {"source": perception.source, "frame": perception.frame, "timestamp": perception.timestamp}
         for row in box_rows(perception):
             self._boxes.writerow({**where, **row})
 
-    def close(self) -> None:
+    def _close(self) -> None:
         """Close the files."""
         for handle in self._handles:
             handle.close()
@@ -167,7 +167,7 @@ class ParquetWriter(Writer):
         self._rows: list[dict[str, Any]] = []
         self._open = True
 
-    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+    def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
         """Write the row of one frame."""
         self._rows.append(
             {
@@ -181,7 +181,7 @@ class ParquetWriter(Writer):
         if len(self._rows) >= ROW_GROUP:
             self._flush()
 
-    def close(self) -> None:
+    def _close(self) -> None:
         """Write what is left, and finish the file."""
         if not self._open:
             return

@@ -39,7 +39,7 @@ class YoloWriter(Writer):
         self._class_names: tuple[str, ...] | None = None
         self._data = self.create("data.yaml")
 
-    def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
+    def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
         """Write the label file of one image; it is empty when there is no box."""
         number = "" if perception.frame is None else f"-{perception.frame:07d}"
         path = self.create(f"labels/{self.stem(perception)}{number}.txt")
@@ -53,9 +53,10 @@ class YoloWriter(Writer):
         self.write_whole(path, "".join(lines))
         self._class_names = perception.class_names
 
-    def close(self) -> None:
+    def _close(self) -> None:
         """Write ``data.yaml``."""
-        if self._class_names is None or self._data in self.files:
+        if self._class_names is None:
             return
         data = {"path": ".", "train": "images", "val": "images", "names": list(self._class_names)}
+        self._class_names = None
         self.write_whole(self._data, yaml.safe_dump(data, sort_keys=False))
