@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from trilitenet.errors import OutputError, replacing, writing
+from trilitenet.errors import OutputError, part_of, replacing, writing
 
 
 def interrupt(path: Path, error: BaseException) -> None:
@@ -36,3 +36,15 @@ def test_writing_tells_the_cause_in_one_line(tmp_path: Path) -> None:
         replacing(tmp_path / "absent" / "a.txt"),
     ):
         pass
+
+
+@pytest.mark.parametrize("name", ["n" * 251 + ".jpg", "\u8def" * 80 + ".openlabel.json", "a.txt"])
+def test_a_temporary_name_is_no_longer_than_the_system_takes(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    with replacing(path) as part:
+        part.write_text("new")
+    part_of(path).write_text("newer")
+    assert part_of(path) != part_of(path.with_name(f"m{name[1:]}"))
+    part_of(path).replace(path)
+    assert path.read_text() == "newer"
+    assert list(tmp_path.iterdir()) == [path]

@@ -22,9 +22,11 @@ import difflib
 import importlib
 import os
 import tempfile
+import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Final
 
 __all__ = [
     "BackendError",
@@ -40,9 +42,15 @@ __all__ = [
     "brief",
     "did_you_mean",
     "import_extra",
+    "part_of",
     "replacing",
     "writing",
 ]
+
+_LONGEST: Final = 255
+"""Bytes of a file name that every file system takes."""
+_BEGINNING: Final = 40
+"""Characters of a long file name, of up to four bytes each, that its temporary name keeps."""
 
 
 class TriLiteNetError(Exception):
@@ -131,6 +139,17 @@ def writing(output: str | Path) -> Iterator[None]:
         raise OutputError(f"{error.filename or output}: cannot be written ({error.strerror or error})") from error
 
 
+def part_of(path: Path) -> Path:
+    """Return where a file is written until it is whole: beside it, with ``.part`` at the end.
+
+    A name of its own where that is longer than the 255 bytes that file systems take.
+    """
+    name = f"{path.name}.part"
+    if len(os.fsencode(name)) > _LONGEST:
+        name = f"{path.name[:_BEGINNING]}.{zlib.crc32(os.fsencode(path.name)):08x}.part"
+    return path.with_name(name)
+
+
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a name beside ``path``; the file written there takes its place in one step once the block is through.
@@ -140,7 +159,7 @@ def replacing(path: Path) -> Iterator[Path]:
     Args:
         path: The file to write; its folder exists.
     """
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:_BEGINNING]}.", suffix=".part")
     os.close(handle)
     part = Path(name)
     try:

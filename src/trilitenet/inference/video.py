@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.errors import OutputError, import_extra
+from trilitenet.errors import OutputError, import_extra, part_of
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Failure, Frame, FrameReader, Stills
 from trilitenet.structures import Perception
@@ -206,7 +206,7 @@ class VideoWriter:
         self._av = import_extra("av", "video")
         self.path = path = Path(path)
         self.frames = 0
-        self._partial = path.with_name(f"{path.name}.part")
+        self._partial = part_of(path)
         self._rate = rate or 30.0
         self._options = {"crf": str(quality), "preset": preset}
         self._size: tuple[int, int] | None = None

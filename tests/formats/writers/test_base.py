@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilitenet.errors import ConfigError, OutputError
-from trilitenet.formats.writers.base import WRITERS, JsonStream, open_writer, part_of
+from trilitenet.errors import ConfigError, OutputError, part_of
+from trilitenet.formats.writers.base import WRITERS, JsonStream, open_writer
 from trilitenet.structures import Boxes, Perception
 
 TASKS_GONE = Perception(size=(120, 200), class_names=("vehicle",), source="tasks.jpg")

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import cv2
@@ -53,3 +54,9 @@ def test_two_pictures_of_one_name_do_not_clash(tmp_path: Path, pictures: list[Pe
         for picture in pictures:
             writer.write(picture)
     assert len(list((tmp_path / "labels").rglob("*.txt"))) == 2
+
+
+def test_what_was_not_looked_for_leaves_no_labels(tmp_path: Path, pictures: list[Perception]) -> None:
+    with YoloWriter(tmp_path) as writer:
+        writer.write(dataclasses.replace(pictures[0], boxes=None))
+    assert list(tmp_path.rglob("*.*")) == writer.files == []

@@ -22,13 +22,13 @@ from pathlib import Path, PurePath
 from types import FrameType, TracebackType
 from typing import IO, TYPE_CHECKING, Any, ClassVar, Final
 
-from trilitenet.errors import ConfigError, OutputError, did_you_mean, writing
+from trilitenet.errors import ConfigError, OutputError, did_you_mean, part_of, writing
 from trilitenet.structures import Perception
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["WRITERS", "JsonStream", "Writer", "find_writer", "open_writer", "part_of"]
+__all__ = ["WRITERS", "JsonStream", "Writer", "find_writer", "open_writer"]
 
 WRITERS: Final[dict[str, str]] = {
     "json": "trilitenet.formats.writers.native:JsonWriter",
@@ -236,11 +236,6 @@ def _uninterrupted() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
         if held:
             before(*held[0])
-
-
-def part_of(path: Path) -> Path:
-    """Return where a file is written until it is whole."""
-    return path.with_name(f"{path.name}.part")
 
 
 class JsonStream:

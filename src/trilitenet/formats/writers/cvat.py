@@ -16,7 +16,8 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.formats.writers.base import Writer, part_of, polylines
+from trilitenet.errors import part_of
+from trilitenet.formats.writers.base import Writer, polylines
 from trilitenet.processing.polygons import mask_to_polygons
 from trilitenet.structures import Perception
 

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any, Final
 
-from trilitenet.errors import import_extra
-from trilitenet.formats.writers.base import Writer, part_of, rounded
+from trilitenet.errors import import_extra, part_of
+from trilitenet.formats.writers.base import Writer, rounded
 from trilitenet.processing.serialise import encode_mask
 from trilitenet.structures import SCHEMA_VERSION, Perception
 

@@ -40,16 +40,17 @@ class YoloWriter(Writer):
         self._data = self.create("data.yaml")
 
     def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
-        """Write the label file of one image; it is empty when there is no box."""
+        """Write the label file of one image: an empty one without boxes, none where they were not looked for."""
+        if perception.boxes is None:
+            return
         number = "" if perception.frame is None else f"-{perception.frame:07d}"
         path = self.create(f"labels/{self.stem(perception)}{number}.txt")
         lines = []
-        if perception.boxes is not None:
-            height, width = perception.size
-            boxes = xyxy_to_cxcywh(perception.boxes.xyxy) / np.array([width, height, width, height], np.float32)
-            for box, class_id, score in zip(boxes, perception.boxes.class_id, perception.boxes.confidence, strict=True):
-                values = " ".join(f"{value:.6f}" for value in box)
-                lines.append(f"{class_id} {values}" + (f" {score:.4f}" if self.confidence else "") + "\n")
+        height, width = perception.size
+        boxes = xyxy_to_cxcywh(perception.boxes.xyxy) / np.array([width, height, width, height], np.float32)
+        for box, class_id, score in zip(boxes, perception.boxes.class_id, perception.boxes.confidence, strict=True):
+            values = " ".join(f"{value:.6f}" for value in box)
+            lines.append(f"{class_id} {values}" + (f" {score:.4f}" if self.confidence else "") + "\n")
         self.write_whole(path, "".join(lines))
         self._class_names = perception.class_names
 
