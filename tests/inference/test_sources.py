@@ -125,8 +125,21 @@ def test_the_index_at_a_variable_frame_rate_counts_what_was_skipped(tmp_path: Pa
         assert [index_of(frame) for frame in frames] == [frame.index for frame in frames]
 
 
-@pytest.mark.parametrize(("matrix", "turns"), [((0, 1, -1, 0), -1), ((-1, 0, 0, -1), 2), ((0, -1, 1, 0), 1)])
-def test_rotation_noted_in_the_file_is_applied(tmp_path: Path, matrix: tuple[int, ...], turns: int) -> None:
+@pytest.mark.parametrize(
+    ("matrix", "upright"),
+    [
+        ((0, 1, -1, 0), np.rot90(shade(0), -1)),
+        ((-1, 0, 0, -1), np.rot90(shade(0), 2)),
+        ((0, -1, 1, 0), np.rot90(shade(0), 1)),
+        ((-1, 0, 0, 1), np.fliplr(shade(0))),
+        ((1, 0, 0, -1), np.flipud(shade(0))),
+        ((0, 1, 1, 0), shade(0).swapaxes(0, 1)),
+        ((0, -1, -1, 0), np.rot90(shade(0), 2).swapaxes(0, 1)),
+    ],
+)
+def test_rotation_and_mirroring_noted_in_the_file_are_applied(
+    tmp_path: Path, matrix: tuple[int, ...], upright: np.ndarray
+) -> None:
     path = video(tmp_path / "a.mp4", frames=2)
     data = bytearray(path.read_bytes())
     place = data.index(b"tkhd") + 4 + 40  # the transformation matrix of the track header, 16.16 fixed point
@@ -134,7 +147,6 @@ def test_rotation_noted_in_the_file_is_applied(tmp_path: Path, matrix: tuple[int
     for offset, value in ((0, a), (4, b), (12, c), (16, d)):
         data[place + offset : place + offset + 4] = value.to_bytes(4, "big", signed=True)
     path.write_bytes(data)
-    upright = np.rot90(shade(0), turns)
     frame = next(iter(VideoReader(path)))
     assert frame.image.shape == upright.shape
     np.testing.assert_allclose(frame.image.astype(int), upright, atol=12)
@@ -388,6 +400,18 @@ def test_what_a_user_names(tmp_path: Path) -> None:
     assert [type(source) for source in found] == [StreamReader]
     (tmp_path / "nothing").mkdir()
     assert find_sources([tmp_path / "nothing"])[1][0].reason.endswith("is an empty folder")
+    (tmp_path / "nothing" / "below").mkdir()
+    (failure,) = find_sources([tmp_path / "nothing"])[1]
+    assert failure.reason.endswith(f"has no files itself; for those in its folders: {str(tmp_path / 'nothing/**/*')!r}")
+
+
+def test_a_picture_by_two_ways_is_one_and_a_link_of_another_name_is_its_own(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    Image.fromarray(shade(0)).save(tmp_path / "folder" / "a.png")
+    (tmp_path / "folder" / "b.png").symlink_to("a.png")
+    (tmp_path / "same").symlink_to("folder")
+    found, _ = find_sources([tmp_path / way for way in ("folder", "folder/../folder/a.png", "same/a.png")])
+    assert [path.name for source in found if isinstance(source, Stills) for path in source.paths] == ["a.png", "b.png"]
 
 
 @pytest.mark.parametrize("wrong", [{"every": 0}, {"max_frames": 0}, {"start": -1}, {"start": 3, "end": 2}])

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from tests.fakes import ColourBackend, coloured_scene
-from trilitenet.errors import BackendError, OutputError
+from trilitenet.errors import BackendError, InputError, OutputError, ShapeError
 from trilitenet.inference.predictor import Predictor
-from trilitenet.inference.sources import Frame, FrameReader, Stills, VideoReader
+from trilitenet.inference.sources import Failure, Frame, FrameReader, Stills, VideoReader
 from trilitenet.inference.video import PerceptionStream, Prefetch, VideoWriter
 from trilitenet.structures import Perception, RawOutputs
 
@@ -137,6 +137,33 @@ def test_failures_keep_their_place(tmp_path: Path) -> None:
     with PerceptionStream(Stills(tuple(paths)), Predictor(ColourBackend(), batch_size=4)) as stream:
         sources = [item.source for item in stream]
     assert sources == [str(path) for path in paths]
+
+
+class WideOnly(ColourBackend):
+    """Refuses batches of upright pictures, as an artefact with bounds does."""
+
+    def run(self, batch: np.ndarray) -> RawOutputs:
+        if batch.shape[1] > batch.shape[2]:
+            raise ShapeError("sides from 64 to 160 pixels are possible")
+        return super().run(batch)
+
+
+def test_a_picture_that_the_backend_cannot_take_stops_no_other(tmp_path: Path) -> None:
+    sizes = [(64, 96), (64, 96), (128, 64), (64, 96), (96, 160)]
+    paths = [tmp_path / f"{i}.ppm" for i in range(len(sizes))]
+    for path, (height, width) in zip(paths, sizes, strict=True):
+        path.write_bytes(b"P6 %d %d 255\n" % (width, height) + bytes(height * width * 3))
+    with PerceptionStream(Stills(tuple(paths)), Predictor(WideOnly(), batch_size=4)) as stream:
+        items = list(stream)
+    assert [item.source for item in items] == [str(path) for path in paths]
+    assert [item.reason for item in items if isinstance(item, Failure)] == [
+        f"{paths[2]}: sides from 64 to 160 pixels are possible"
+    ]
+    with (
+        PerceptionStream(Scenes(3, (160, 96)), Predictor(WideOnly(), batch_size=2)) as stream,
+        pytest.raises(InputError, match="scenes: sides from 64"),
+    ):
+        list(stream)
 
 
 def test_stages_overlap() -> None:

@@ -191,9 +191,9 @@ class FrameReader(abc.ABC):
 class VideoReader(FrameReader):
     """A video file, or standard input, by PyAV.
 
-    Rotation noted in the file is applied, time stamps are the file's own (so that a variable frame rate is kept), and a
-    frame that cannot be decoded is left out and counted. Where the frame rate varies and the beginning is skipped, the
-    index is estimated by the mean rate.
+    Rotation and mirroring noted in the file are applied, time stamps are the file's own (so that a variable frame rate
+    is kept), and a frame that cannot be decoded is left out and counted. Where the frame rate varies and the beginning
+    is skipped, the index is estimated by the mean rate.
 
     Args:
         path: The file, or ``"-"`` for standard input.
@@ -462,9 +462,10 @@ def find_sources(
                 if (shown := _printable(str(path))) != str(path):
                     failures.append(Failure(shown, f"{shown}: its name is not UTF-8; rename it"))
                     continue
-                if path.absolute() in taken:
+                place = path.parent.resolve() / path.name  # a link of another name gives a result of its own
+                if place in taken:
                     continue
-                taken.add(path.absolute())
+                taken.add(place)
                 if path.suffix.lower() in VIDEO_SUFFIXES:
                     add(functools.partial(VideoReader, path, clip), str(path))
                 else:
@@ -502,6 +503,8 @@ def _expand(name: str) -> list[Path]:
     if path.is_dir():
         files = [child for child in path.iterdir() if child.is_file() and not child.name.startswith(".")]
         if not files:
+            if any(child.is_dir() for child in path.iterdir()):
+                raise InputError(f"{name}: has no files itself; for those in its folders: {str(path / '**' / '*')!r}")
             raise InputError(f"{name}: is an empty folder")
     elif path.exists():
         return [path]
@@ -589,6 +592,13 @@ def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
 
 
 def _upright(frame: Any) -> NDArray[np.uint8]:
+    """Return the RGB image as it is to be shown: turned by multiples of 90 degrees, and mirrored."""
     image: NDArray[np.uint8] = frame.to_ndarray(format="rgb24")
-    turns = round(frame.rotation / 90) % 4
-    return np.ascontiguousarray(np.rot90(image, turns)) if turns else image
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return image
+    # x' = a x + c y, y' = b x + d y; FFmpeg's av_display_rotation_get knows the angle alone, not the mirror.
+    a, b, _, c, d, *_ = np.frombuffer(matrix, np.int32).tolist()
+    if abs(b) > abs(a):
+        image, a, d = image.swapaxes(0, 1), c, b
+    return np.ascontiguousarray(image[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])

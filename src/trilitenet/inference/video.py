@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.errors import OutputError, import_extra, part_of
+from trilitenet.errors import InputError, OutputError, ShapeError, import_extra, part_of
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Failure, Frame, FrameReader, Stills
 from trilitenet.structures import Perception
@@ -157,7 +157,11 @@ class PerceptionStream:
 def _perceive(
     items: Iterable[Frame | Failure], predictor: Predictor, batch_size: int
 ) -> Iterator[Perception | Failure]:
-    """Yield a perception for each frame, in order; failures pass through."""
+    """Yield a perception for each frame, in order; failures pass through.
+
+    Raises:
+        InputError: If the predictor cannot take the frames of a video; a picture that it cannot take is a failure.
+    """
     batch: list[Frame | Failure] = []
     for item in items:
         batch.append(item)
@@ -169,7 +173,19 @@ def _perceive(
 
 def _perceive_batch(batch: Sequence[Frame | Failure], predictor: Predictor) -> Iterator[Perception | Failure]:
     frames = [item for item in batch if isinstance(item, Frame)]
-    perceptions = iter(predictor.perceive([frame.image for frame in frames], [frame.source for frame in frames]))
+    try:
+        perceptions = iter(predictor.perceive([frame.image for frame in frames], [frame.source for frame in frames]))
+    except ShapeError as error:
+        if len(batch) > 1:  # which one it is shows when each goes alone
+            for item in batch:
+                yield from _perceive_batch([item], predictor)
+            return
+        (frame,) = frames
+        reason = f"{frame.source}: {error}"
+        if frame.index is not None:
+            raise InputError(reason) from error
+        yield Failure(frame.source, reason)
+        return
     for item in batch:
         if isinstance(item, Failure):
             yield item
