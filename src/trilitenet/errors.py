@@ -29,6 +29,7 @@ from types import ModuleType
 from typing import Final
 
 __all__ = [
+    "LONGEST_NAME",
     "BackendError",
     "ConfigError",
     "DataError",
@@ -47,7 +48,7 @@ __all__ = [
     "writing",
 ]
 
-_LONGEST: Final = 255
+LONGEST_NAME: Final = 255
 """Bytes of a file name that every file system takes."""
 _BEGINNING: Final = 40
 """Characters of a long file name, of up to four bytes each, that its temporary name keeps."""
@@ -145,7 +146,7 @@ def part_of(path: Path) -> Path:
     A name of its own where that is longer than the 255 bytes that file systems take.
     """
     name = f"{path.name}.part"
-    if len(os.fsencode(name)) > _LONGEST:
+    if len(os.fsencode(name)) > LONGEST_NAME:
         name = f"{path.name[:_BEGINNING]}.{zlib.crc32(os.fsencode(path.name)):08x}.part"
     return path.with_name(name)
 

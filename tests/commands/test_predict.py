@@ -341,6 +341,26 @@ def test_names_that_no_file_can_have_are_failures_of_their_own(
     assert "\\xe4.png" in report.failures[0].reason
 
 
+@pytest.mark.parametrize(
+    ("formats", "stem", "images"),
+    [(("json",), 251, 1), (("json", "openlabel", "cvat"), 240, 2), (("openlabel",), 241, 1), (("json",), 250, 2)],
+)
+def test_the_longest_names_are_no_trouble_or_a_failure_of_their_own(
+    tmp_path: Path, predictor: Predictor, formats: tuple[str, ...], stem: int, images: int
+) -> None:
+    (tmp_path / "in").mkdir()
+    for name in ("n" * stem + ".png", "photo.png"):
+        Image.fromarray(coloured_scene()).save(tmp_path / "in" / name)
+    video = tmp_path / "in" / ("v" * stem + ".mkv")
+    with VideoWriter(tmp_path / "v.mp4") as writer:
+        writer.write(coloured_scene())
+    (tmp_path / "v.mp4").rename(video)
+    report = predict_with(predictor, [tmp_path / "in"], tmp_path / "out", format=formats)
+    assert (report.images, report.videos) == (images, images - 1)
+    assert ["name is too long" in failure.reason for failure in report.failures] == [True] * 2 * (2 - images)
+    assert not list((tmp_path / "out").glob("*.part"))
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are sent in another way")
 def test_ctrl_c_in_a_process_of_its_own(tmp_path: Path) -> None:
     source, output = drive(tmp_path / "drive.mp4", frames=600), tmp_path / "out"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
+import os
 import re
 import time
 from collections.abc import Iterator, Sequence
@@ -21,7 +22,7 @@ from rich.text import Text
 
 from trilitenet.commands.load import load
 from trilitenet.commands.paths import text_paths
-from trilitenet.errors import BackendError, InputError, OutputError, ShapeError, replacing, writing
+from trilitenet.errors import LONGEST_NAME, BackendError, InputError, OutputError, ShapeError, replacing, writing
 from trilitenet.formats.writers.base import Writer, find_writer, open_writer
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, Failure, FrameReader, Stills, find_sources
@@ -260,11 +261,28 @@ class _Job:
         self.overwrite = overwrite
         self.names = [name for source in self.sources for name in _names(source)]
         self.stems = _allot_stems(self.names)
+        self._leave_out_long_names()
         self._check_output()
         self._check_formats()
         self.writers: list[Writer] = []
         self.images = self.videos = self.frames = 0
         self.files: list[Path] = []
+
+    def _leave_out_long_names(self) -> None:
+        """Make a source whose results would have longer names than file systems take a failure of its own."""
+        sources: list[Stills | FrameReader] = []
+        for source in self.sources:
+            patterns = [pattern for name in self.formats for pattern in _patterns(find_writer(name), source)]
+            endings = [PurePath(pattern).name.replace("*", "0000000").format("") for pattern in patterns]
+            longest = max(map(len, [".jpg", *endings]))
+            fitting = {name for name in _names(source) if len(os.fsencode(self.stems[name])) + longest <= LONGEST_NAME}
+            reason = "its name is too long for the names of its results; rename it"
+            self.failures += [Failure(name, f"{name}: {reason}") for name in _names(source) if name not in fitting]
+            if isinstance(source, Stills):
+                source = Stills(tuple(path for path in source.paths if str(path) in fitting))
+            if fitting:
+                sources.append(source)
+        self.sources = sources
 
     def _check_output(self) -> None:
         if self.output.exists() and not self.output.is_dir():
@@ -305,7 +323,7 @@ class _Job:
             writer = find_writer(name)
             files = dict.fromkeys(writer.FILES, "everything")
             for source in self.sources:
-                patterns = writer.PICTURE_FILES if isinstance(source, Stills) else writer.VIDEO_FILES
+                patterns = _patterns(writer, source)
                 files |= {pattern.format(self.stems[each]): each for pattern in patterns for each in _names(source)}
             yield from ((file, f"as {name} of {each}") for file, each in files.items())
 
@@ -438,6 +456,10 @@ def _follow(perception: Perception, parts: tuple[Steady | None, RoadMonitor | No
 
 def _names(source: Stills | FrameReader) -> list[str]:
     return [str(path) for path in source.paths] if isinstance(source, Stills) else [source.name]
+
+
+def _patterns(writer: type[Writer], source: Stills | FrameReader) -> tuple[str, ...]:
+    return writer.PICTURE_FILES if isinstance(source, Stills) else writer.VIDEO_FILES
 
 
 def _numbered(file: str) -> str:
