@@ -1,12 +1,13 @@
 from __future__ import annotations
 
 import io
+import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from trilitenet.errors import InputError, ShapeError
 from trilitenet.processing.images import read_image, to_rgb
@@ -61,6 +62,24 @@ def test_the_rotation_in_exif_is_applied(orientation: int, turns: int) -> None:
     assert np.abs(image.astype(int) - upright).max() <= 8
 
 
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_all_orientations_agree_with_pillow(orientation: int) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    data = encoded(Image.fromarray(gradient()), "PNG", exif=exif)
+    upright = ImageOps.exif_transpose(Image.open(io.BytesIO(data)))
+    np.testing.assert_array_equal(read_image(data), np.asarray(upright))
+
+
+def test_other_tags_in_exif_do_not_matter() -> None:
+    tags = struct.pack("<HHII", 0x0112, 3, 1, 6)  # to be turned
+    tags += struct.pack("<HHI4s", 0x011A, 2, 3, b"72\0")  # XResolution as text, which is not allowed
+    exif = b"Exif\0\0II*\0" + struct.pack("<IH", 8, 2) + tags + struct.pack("<I", 0)
+    assert read_image(encoded(Image.fromarray(gradient(40, 60)), "JPEG", exif=exif)).shape == (60, 40, 3)
+    damaged = b"Exif\0\0" + b"no TIFF at all"
+    assert read_image(encoded(Image.fromarray(gradient(40, 60)), "JPEG", exif=damaged)).shape == (40, 60, 3)
+
+
 def test_broken_files_are_named(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (200, 200, 3), dtype=np.uint8)
     jpeg, png = encoded(Image.fromarray(noise), "JPEG"), encoded(Image.fromarray(noise), "PNG")
@@ -97,8 +116,13 @@ def test_arrays() -> None:
 
 @pytest.mark.parametrize("values", [[0.0, 0.5, 1.0], [0.0, np.nan, 200.0], [0.0, np.inf, 1.0]])
 def test_fractions_are_refused_not_taken_for_black(values: list[float]) -> None:
-    with pytest.raises(InputError, match=r"scale it to 0 \.\. 255"):
+    with pytest.raises(InputError, match=r"^the image: holds fractions .* scale it to 0 \.\. 255"):
         read_image(encoded(Image.fromarray(np.array([values], np.float32)), "TIFF"))
+
+
+def test_photos_of_phones_are_named_with_the_cure() -> None:
+    with pytest.raises(InputError, match="HEIC images cannot be read; save it as JPEG"):
+        read_image(b"\0\0\0\x18ftypheic" + bytes(100))
 
 
 @pytest.mark.parametrize("image", [None, 3, bytearray(b"x"), object()])

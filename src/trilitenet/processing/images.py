@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image
 
 from trilitenet.errors import InputError, ShapeError
 
@@ -21,6 +21,20 @@ IMAGE_SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".t
 
 _BROKEN = (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error, Image.DecompressionBombError)
 """What Pillow's decoders raise on broken files."""
+
+_TURNS: Final = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""What makes an image upright, by its orientation in EXIF."""
+
+_HEIF: Final = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
+"""Brands of HEIC and HEIF files, the photos of many phones."""
 
 
 def read_image(image: str | Path | bytes | Image.Image | NDArray[Any]) -> NDArray[np.uint8]:
@@ -62,6 +76,8 @@ def read_image(image: str | Path | bytes | Image.Image | NDArray[Any]) -> NDArra
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             opened = Image.open(io.BytesIO(data))
     except _BROKEN as error:
+        if data[4:8] == b"ftyp" and data[8:12] in _HEIF:
+            raise InputError(f"{name}: HEIC images cannot be read; save it as JPEG") from error
         raise InputError(f"{name}: is not an image that can be read ({_reason(error)})") from error
     with opened:
         return _decode(opened, name)
@@ -94,13 +110,23 @@ def to_rgb(array: NDArray[Any]) -> NDArray[np.uint8]:
 def _decode(image: Image.Image, name: str) -> NDArray[np.uint8]:
     try:
         image.load()
-        if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:  # asked first, because both calls always copy
-            image = ImageOps.exif_transpose(image)
+        if (turn := _TURNS.get(_orientation(image))) is not None:
+            image = image.transpose(turn)
         if image.mode in {"I", "F"} or image.mode.startswith("I;16"):
             return _scale_deep(np.asarray(image), name, deep=image.mode.startswith("I;16"))
         return np.array(image if image.mode == "RGB" else image.convert("RGB"), np.uint8)
+    except InputError:
+        raise
     except _BROKEN as error:
         raise InputError(f"{name}: is broken or truncated ({_reason(error)})") from error
+
+
+def _orientation(image: Image.Image) -> Any:
+    """Return the orientation that EXIF notes; 1, upright, if EXIF cannot be read: the pixels may be whole."""
+    try:
+        return image.getexif().get(ExifTags.Base.Orientation, 1)
+    except (*_BROKEN, TypeError):
+        return 1
 
 
 def _scale_deep(grey: NDArray[Any], name: str, *, deep: bool) -> NDArray[np.uint8]:
