@@ -162,12 +162,36 @@ def test_several_values_may_follow_one_option() -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("words", "spread"),
+    [
+        ("data prepare DIR --splits train val", "data prepare DIR --splits train --splits val"),
+        ("data prepare --splits train val-2024 DIR OUT", "data prepare --splits train --splits val-2024 DIR OUT"),
+        ("predict --format json csv a.jpg", "predict --format json --format csv a.jpg"),
+        ("predict --hide boxes labels a.jpg", "predict --hide boxes --hide labels a.jpg"),
+        ("data show --where a=b c=d DIR", "data show --where a=b --where c=d DIR"),
+        ("data convert --lane-width train=8 4 A B", "data convert --lane-width train=8 --lane-width 4 A B"),
+        ("evaluate --by scene weather tiny", "evaluate --by scene --by weather tiny"),
+        ("export --format onnx tiny", "export --format onnx tiny"),
+    ],
+)
+def test_no_second_value_is_taken_for_a_file(words: str, spread: str) -> None:
+    assert cli._repeated(words.split()) == spread.split()
+
+
 def test_the_values_that_may_follow_are_those_that_there_are() -> None:
     from trilitenet.commands.export import Precision
     from trilitenet.commands.load import BACKENDS
+    from trilitenet.engine.scorecard import CONDITIONS
+    from trilitenet.formats.writers.base import WRITERS
+    from trilitenet.processing.drawing import PARTS
+    from trilitenet.road.drawing import ROAD_PARTS
 
     assert set(cli._LISTS["--backend"].split("|")) == set(BACKENDS)
     assert set(cli._LISTS["--precisions"].split("|")) == set(get_args(Precision))
+    assert cli._LISTS["--by"].split("|") == list(CONDITIONS)
+    assert cli._LISTS["--format"].split("|") == list(WRITERS)
+    assert cli._LISTS["--hide"].split("|") == [*PARTS, *ROAD_PARTS]
 
 
 def test_an_unknown_level_of_the_log_is_one_line(

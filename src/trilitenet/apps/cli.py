@@ -125,9 +125,15 @@ def build_app(words: Sequence[str] = (), *, everything: bool = False) -> cyclopt
 _LISTS: Final = {
     "--backend": "auto|torch|onnxruntime|openvino|tensorrt|ncnn",
     "--batch": r"\d+",
+    "--by": "timeofday|weather|scene",
+    "--format": "json|jsonl|scalabel|openlabel|coco|yolo|cvat|parquet|csv",
+    "--hide": "drivable|lane|boxes|labels|lines|distances|above|status",
+    "--lane-width": r"([\w*.-]+=)?\d+(\.\d+)?",
     "--precisions": "fp32|fp16|bf16|int8",
     "--resolution": r"\d+",
     "--severities": r"\d+",
+    "--splits": r"(train|val|valid|validation|test)([-_.]\w+)?",
+    "--where": r"[\w.-]+=.+",
 }
 """Options that take several values, and what a value looks like, so that no file or model is taken for one."""
 
