@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -22,9 +23,11 @@ CLASSES: dict[str, tuple[str, ...]] = {"car": ("car",), "truck": ("truck",)}
 
 def test_what_the_writer_writes_comes_back(perceptions: list[Perception], tmp_path: Path) -> None:
     with open_writer("cvat", tmp_path / "data") as writer:
-        for perception in perceptions:
+        for perception in [*perceptions, dataclasses.replace(perceptions[0], source="drive.mp4", frame=0)]:
             writer.write(perception)
+    assert (tmp_path / "data" / "drive.cvat-video.xml").exists()
     source = read_cvat(tmp_path / "data", LabelMapping(classes=CLASSES))
+    assert source.found[-1] == "files of the kind 'CVAT for video', left out: 1"
     convert(source, tmp_path / "out", ConversionOptions(classes=CLASSES))
     dataset = DrivingDataset(tmp_path / "out", "train")
     assert dataset.names == ["one", "two"]

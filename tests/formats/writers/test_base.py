@@ -121,6 +121,16 @@ def test_ctrl_c_waits_until_a_result_is_whole(
     assert not list(tmp_path.glob("*.part"))
 
 
+def test_pictures_of_one_name_are_listed_with_their_folders(tmp_path: Path, pictures: list[Perception]) -> None:
+    with open_writer("coco", tmp_path) as writer:
+        for picture in pictures:
+            writer.stem(picture)
+        for picture in [*pictures, dataclasses.replace(pictures[0], source="day/other.jpg")]:
+            writer.write(picture)
+    images = json.loads((tmp_path / "coco.json").read_text())["images"]
+    assert [image["file_name"] for image in images] == ["day/road.jpg", "night/road.jpg", "other.jpg"]
+
+
 @pytest.mark.parametrize("name", ["coco", "json", "openlabel", "scalabel"])
 def test_a_failed_write_leaves_no_file_with_a_gap(
     name: str, tmp_path: Path, video: list[Perception], monkeypatch: pytest.MonkeyPatch

@@ -24,8 +24,12 @@ _SPLITS = {"train": "train", "training": "train", "val": "val", "validation": "v
 _SHAPES = {"box", "polygon", "polyline", "mask", "points", "ellipse", "cuboid", "skeleton", "tag"}
 
 
+class _OfVideoError(DataError):
+    """A file of the kind *CVAT for video*, whose frames are no pictures that could be read."""
+
+
 def read_cvat(root: str | Path, mapping: LabelMapping | None = None) -> ListedRecords:
-    """Read a data set exported from CVAT.
+    """Read a data set exported from CVAT. Files of videos are left out where there are files of images.
 
     Args:
         root: The folder with ``annotations.xml`` (or any ``.xml`` of this kind) and the images, or the file.
@@ -41,14 +45,21 @@ def read_cvat(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
         raise DataError(f"{root}: no .xml file; export the task from CVAT as 'CVAT for images 1.1'")
     folder = root.parent if root.is_file() else root
     records: dict[str, list[ImageRecord]] = defaultdict(list)
-    missing = 0
+    missing = videos = 0
     for path in files:
-        missing += _read_file(path, folder, mapping, records)
+        try:
+            missing += _read_file(path, folder, mapping, records)
+        except _OfVideoError:
+            videos += 1
+            if videos == len(files):
+                raise
     if not any(records.values()):
         raise DataError(f"{root}: none of the images that the .xml lists is there; put them beside it or in images/")
     found = [f"{split}: {len(items)} images" for split, items in records.items()]
     if missing:
         found.append(f"{missing} listed images are not there")
+    if videos:
+        found.append(f"files of the kind 'CVAT for video', left out: {videos}")
     return ListedRecords(records, tuple(found), mapping.origin("cvat", root))
 
 
@@ -60,7 +71,7 @@ def _read_file(path: Path, folder: Path, mapping: LabelMapping, records: dict[st
             if element.tag == "label" and element.find("name") is not None:
                 categories.add(element.findtext("name") or "")
             elif element.tag == "track":
-                raise DataError(f"{path}: is of the kind 'CVAT for video'; export it as 'CVAT for images 1.1'")
+                raise _OfVideoError(f"{path}: is of the kind 'CVAT for video'; export it as 'CVAT for images 1.1'")
             elif element.tag == "image":
                 images.append(element)
                 categories |= {shape.get("label", "") for shape in element}

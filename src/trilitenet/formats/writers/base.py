@@ -17,6 +17,7 @@ import importlib
 import json
 import signal
 import threading
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePath
 from types import FrameType, TracebackType
@@ -71,7 +72,7 @@ class Writer(abc.ABC):
         self._begun: list[Path] = []
         self._stems: dict[str, str] = {}
         self._taken: set[str] = set()
-        self._names: dict[str, str] = {}
+        self._names: Counter[str] = Counter()
         self._unnamed = 0
         self._broken = False
 
@@ -173,14 +174,15 @@ class Writer(abc.ABC):
                 number += 1
                 name = f"{stem}-{number}"
             self._stems[source] = name
+            self._names[PurePath(source).name] += 1
             self._taken.add(name)
         return self._stems[source]
 
     def image_name(self, perception: Perception) -> str:
         """Return the name of the picture as data sets list it.
 
-        A still image keeps its file name (its whole path where that name is taken by another); a frame of a video gets
-        ``NAME-0000012.jpg``, as the frames of BDD100K's videos are called.
+        A still image keeps its file name (its whole path where another source that `stem` has named so far is called
+        the same); a frame of a video gets ``NAME-0000012.jpg``, as the frames of BDD100K's videos are called.
         """
         stem = self.stem(perception)
         if perception.frame is not None:
@@ -188,8 +190,7 @@ class Writer(abc.ABC):
         if perception.source is None:
             return f"{stem}.jpg"
         name = PurePath(perception.source).name
-        owner = self._names.setdefault(name, perception.source)
-        return name if owner == perception.source else PurePath(perception.source).as_posix()
+        return name if self._names[name] == 1 else PurePath(perception.source).as_posix()
 
 
 def open_writer(format: str, output: str | Path, *, overwrite: bool = False, **options: Any) -> Writer:
