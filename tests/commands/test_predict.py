@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -156,6 +157,16 @@ def test_a_video(tmp_path: Path, predictor: Predictor) -> None:
     assert [frame.timestamp for frame in overlay] == pytest.approx([i / 10 for i in range(12)], abs=1e-3)
     tinted = overlay[3].image[150, 20].astype(int)
     np.testing.assert_allclose(tinted, np.array([20, 200, 20]) * 0.58 + np.array([0, 158, 115]) * 0.42, atol=12)
+
+
+def test_the_overlay_keeps_the_shape_of_pixels(tmp_path: Path, predictor: Predictor) -> None:
+    with VideoWriter(tmp_path / "wide.mp4") as writer:
+        writer.pixel_aspect = Fraction(4, 3)
+        writer.write(coloured_scene())
+    predict_with(predictor, [tmp_path / "wide.mp4"], tmp_path / "out")
+    overlay = VideoReader(tmp_path / "out" / "wide.mp4")
+    assert next(iter(overlay)).image.shape == (360, 640, 3)
+    assert overlay.pixel_aspect == Fraction(4, 3)
 
 
 def test_parts_of_a_video(tmp_path: Path, predictor: Predictor) -> None:

@@ -152,6 +152,26 @@ def test_rotation_and_mirroring_noted_in_the_file_are_applied(
     np.testing.assert_allclose(frame.image.astype(int), upright, atol=12)
 
 
+@pytest.mark.parametrize(("turned", "aspect"), [(0, Fraction(4, 3)), (90, Fraction(3, 4)), (180, Fraction(4, 3))])
+def test_pixels_that_are_no_squares_are_told(tmp_path: Path, turned: int, aspect: Fraction) -> None:
+    with VideoWriter(tmp_path / "a.mp4", 10) as writer:
+        writer.pixel_aspect = Fraction(4, 3)
+        writer.write(shade(0))
+    with av.open(str(tmp_path / "a.mp4")) as plain, av.open(str(tmp_path / "b.mp4"), "w") as container:
+        stream = container.add_stream_from_template(plain.streams.video[0])
+        stream.set_display_rotation(turned)
+        for packet in plain.demux(plain.streams.video[0]):
+            if packet.dts is not None:
+                packet.stream = stream
+                container.mux(packet)
+    reader = VideoReader(tmp_path / "b.mp4")
+    assert next(iter(reader)).image.shape == ((160, 96, 3) if turned == 90 else (96, 160, 3))
+    assert reader.pixel_aspect == aspect
+    reader = VideoReader(video(tmp_path / "c.mp4", frames=1))
+    assert len(list(reader)) == 1
+    assert reader.pixel_aspect is None
+
+
 def test_broken_frames_are_left_out_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     data = bytearray(transport_stream(0, 20))
     rng = np.random.default_rng(0)

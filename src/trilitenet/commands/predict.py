@@ -397,6 +397,8 @@ class _Job:
                     if isinstance(item, Failure):
                         self.failures.append(item)
                     else:
+                        if video is not None and isinstance(source, FrameReader) and not video.frames:
+                            video.pixel_aspect = source.pixel_aspect
                         try:
                             perception, road = _follow(item, follow or self.road.open(still=True))
                         except ShapeError as error:  # of another shape than the camera's pictures

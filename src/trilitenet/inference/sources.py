@@ -21,6 +21,7 @@ import threading
 import time
 import urllib.parse
 from collections.abc import Callable, Iterator, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -143,6 +144,7 @@ class FrameReader(abc.ABC):
         rate: Frames a second as the source states it, before ``clip.every``; None if unknown.
         expected: About how many frames it will give; None if unknown.
         broken: Frames so far that could not be decoded and were left out.
+        pixel_aspect: Width of an upright pixel by its height; None for squares, and before the first frame.
     """
 
     live = False
@@ -153,6 +155,7 @@ class FrameReader(abc.ABC):
         self.rate: float | None = None
         self.expected: int | None = None
         self.broken = 0
+        self.pixel_aspect: Fraction | None = None
         self._closed = threading.Event()
 
     def close(self) -> None:
@@ -588,17 +591,27 @@ def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
                 first = seconds if first is None else first
                 timestamp = seconds - first
             last = timestamp
+            aspect = stream.sample_aspect_ratio or Fraction(1)
+            reader.pixel_aspect = None if aspect == 1 else 1 / aspect if _orientation(frame)[2] else aspect
             yield timestamp, functools.partial(_upright, frame)
 
 
 def _upright(frame: Any) -> NDArray[np.uint8]:
     """Return the RGB image as it is to be shown: turned by multiples of 90 degrees, and mirrored."""
     image: NDArray[np.uint8] = frame.to_ndarray(format="rgb24")
+    right, down, swapped = _orientation(frame)
+    if swapped:
+        image = image.swapaxes(0, 1)
+    return np.ascontiguousarray(image[::down, ::right])
+
+
+def _orientation(frame: Any) -> tuple[int, int, bool]:
+    """Return the directions to read the columns and rows in, 1 or -1, once those have swapped places or not."""
     matrix = frame.side_data.get("DISPLAYMATRIX")
     if matrix is None:
-        return image
+        return 1, 1, False
     # x' = a x + c y, y' = b x + d y; FFmpeg's av_display_rotation_get knows the angle alone, not the mirror.
     a, b, _, c, d, *_ = np.frombuffer(matrix, np.int32).tolist()
-    if abs(b) > abs(a):
-        image, a, d = image.swapaxes(0, 1), c, b
-    return np.ascontiguousarray(image[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
+    swapped = abs(b) > abs(a)
+    x, y = (c, b) if swapped else (a, d)
+    return -1 if x < 0 else 1, -1 if y < 0 else 1, swapped

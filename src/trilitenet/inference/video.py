@@ -206,6 +206,10 @@ class VideoWriter:
         preset: x264's trade of speed for size.
         ahead: Frames that may wait for the encoder.
 
+    Attributes:
+        frames: Frames given so far.
+        pixel_aspect: Width of a pixel by its height, None for squares; to be set before the first frame.
+
     Raises:
         MissingExtraError: If PyAV is not installed.
     """
@@ -222,6 +226,7 @@ class VideoWriter:
         self._av = import_extra("av", "video")
         self.path = path = Path(path)
         self.frames = 0
+        self.pixel_aspect: Fraction | None = None
         self._partial = part_of(path)
         self._rate = rate or 30.0
         self._options = {"crf": str(quality), "preset": preset}
@@ -330,6 +335,8 @@ class VideoWriter:
         self._stream.pix_fmt = "yuv420p"
         context = self._stream.codec_context
         context.time_base = Fraction(1, _CLOCK)
+        if self.pixel_aspect is not None:
+            context.sample_aspect_ratio = self.pixel_aspect
         context.colorspace = context.color_primaries = context.color_trc = 6  # SMPTE 170M, which is BT.601
         context.color_range = 1
 
