@@ -43,6 +43,7 @@ __all__ = [
     "get_variant",
     "parse",
     "read_yaml",
+    "shipped_weights",
 ]
 
 Task = Literal["detection", "drivable", "lane"]
@@ -105,6 +106,11 @@ def get_variant(name: str) -> VariantConfig:
     if name not in VARIANTS:
         raise ConfigError(f"unknown variant {name!r}; known: {', '.join(VARIANTS)}")
     return VARIANTS[name]
+
+
+def shipped_weights() -> dict[str, Path]:
+    """Return the weight files that come with the package, by variant name."""
+    return {path.stem: path for path in sorted((Path(__file__).parent / "weights").glob("*.safetensors"))}
 
 
 def check_tasks(tasks: tuple[str, ...] | list[str]) -> tuple[Task, ...]:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import inspect
 import subprocess
 import sys
+from pathlib import Path
 from typing import get_args
 
 import pytest
@@ -134,6 +135,23 @@ def test_python_m_is_the_command() -> None:
     done = subprocess.run([sys.executable, "-m", "trilitenet", "--version"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0
     assert done.stdout.startswith("trilitenet ")
+
+
+@pytest.mark.parametrize(
+    "words", ["predict photo.jpg", "export tiny", "weights info tiny", "train recipe.yaml"], ids=lambda words: words
+)
+def test_without_pytorch_is_one_line(words: str, tmp_path: Path) -> None:
+    (tmp_path / "photo.jpg").write_bytes(b"x")
+    code = (
+        "import sys\n"
+        "sys.modules['torch'] = None\n"
+        "from trilitenet.apps.cli import main\n"
+        f"sys.exit(main({words.split()!r}))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: this needs PyTorch")
+    assert done.stderr.count("\n") == 1
 
 
 def test_several_values_may_follow_one_option() -> None:

@@ -145,6 +145,30 @@ def test_scoring_and_comparing_load_no_torch() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def test_evaluating_an_artefact_needs_no_torch(artefacts: Artefacts, data: Path) -> None:
+    model = artefacts.folder / "model.onnx"
+    code = (
+        "import sys\n"
+        "sys.modules['torch'] = None\n"
+        "from pathlib import Path\n"
+        "from trilitenet.commands.evaluate import evaluate\n"
+        f"evaluate({str(model)!r}, data=Path({str(data)!r}), backend='onnxruntime', limit=1, resamples=0, worst=0)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr
+
+
+def test_data_of_other_classes_are_told(
+    artefacts: Artefacts, data: Path, weights: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    model = str(artefacts.folder / "model.onnx")
+    evaluate(model, data=data, backend="onnxruntime", limit=1, resamples=0, worst=0)
+    assert "the model knows class_0, class_1, the data hold car" in caplog.text
+    caplog.clear()
+    evaluate(str(weights), data=data, limit=1, resamples=0, worst=0)
+    assert not caplog.text
+
+
 def test_an_artefact_that_decides_masks_is_not_measured_by_the_published_protocol(
     artefacts: Artefacts, data: Path
 ) -> None:

@@ -15,8 +15,9 @@ from tests.models.conftest import published_state
 from trilitenet.apps.cli import main
 from trilitenet.commands.synthesize import synthesize
 from trilitenet.commands.weights import finish, import_weights, info
+from trilitenet.config import shipped_weights
 from trilitenet.errors import ConfigError, OutputError, WeightsError
-from trilitenet.models.weights import load_network, read_card, shipped_weights
+from trilitenet.models.weights import load_network, read_card
 
 
 @pytest.fixture

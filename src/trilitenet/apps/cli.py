@@ -183,6 +183,14 @@ def main(words: Sequence[str] | None = None) -> int:
         return _fail(_one_line(error), code=2)
     except TriLiteNetError as error:
         return _fail(str(error), code=1)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "torch":
+            raise
+        return _fail(
+            "this needs PyTorch, which is not installed: pip install 'torch>=2.4,<2.14'; "
+            "without it, exported files run on ONNX Runtime, OpenVINO and NCNN",
+            code=1,
+        )
     except KeyboardInterrupt:
         return _fail("interrupted", code=130)
     except BrokenPipeError:  # the reader, such as `head`, has gone

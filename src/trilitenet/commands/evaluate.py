@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import logging
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from trilitenet.commands.load import load
 from trilitenet.commands.paths import text_paths
-from trilitenet.config import ArtefactInfo
+from trilitenet.config import ArtefactInfo, shipped_weights
 from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER, DrivingDataset
 from trilitenet.engine.evaluate import EvaluatedPredictor
 from trilitenet.engine.evaluate import evaluate as run_evaluation
@@ -25,6 +26,8 @@ from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.corruptions import SEVERITIES
 
 __all__ = ["evaluate", "hash_dataset", "hash_model", "write_report"]
+
+_LOGGER: Final = logging.getLogger(__name__)
 
 
 @text_paths
@@ -104,6 +107,8 @@ def evaluate(
     _check_artefact(model, predictor, protocol)
     with predictor, ExitStack() as stack:
         dataset = DrivingDataset(data, split, class_names=predictor.card.class_names)
+        if "detection" in predictor.card.tasks:
+            _warn_of_foreign(dataset)
         writer = None
         if save is not None:
             writer = stack.enter_context(PredictionWriter(save, predictor.card.tasks, overwrite=overwrite))
@@ -164,6 +169,18 @@ def _check_artefact(model: str, predictor: Predictor, protocol: str) -> None:
         )
 
 
+def _warn_of_foreign(dataset: DrivingDataset) -> None:
+    """Warn if no box of the data set is of a class that the model knows."""
+    if categories := dataset.foreign_categories():
+        _LOGGER.warning(
+            "no box of %s is of a class of the model, so detection cannot score: the model knows %s, the data hold %s; "
+            "say under classes: in dataset.yaml which categories make up a class",
+            dataset.root,
+            ", ".join(dataset.class_names),
+            ", ".join(categories[:10]) + (" and others" if len(categories) > 10 else ""),
+        )
+
+
 def _resized(predictor: Predictor, sides: Sequence[int]) -> dict[int, EvaluatedPredictor]:
     if predictor.backend.canvas is not None:
         height, width = predictor.backend.canvas
@@ -175,8 +192,6 @@ def _resized(predictor: Predictor, sides: Sequence[int]) -> dict[int, EvaluatedP
 
 def hash_model(model: str) -> str | None:
     """Return the SHA-256 of a weight file, or of the files of an exported artefact."""
-    from trilitenet.models.weights import shipped_weights
-
     path = shipped_weights().get(model) or Path(model)
     if path.is_dir():
         return hash_files(file for file in path.rglob("*") if file.is_file())

@@ -230,6 +230,22 @@ class DrivingDataset:
         own = content.get("attributes") if isinstance(content, dict) else None
         return {str(key): str(value) for key, value in (own or {}).items()} | self._extra.get(name, {})
 
+    def foreign_categories(self) -> tuple[str, ...]:
+        """Return the categories of the boxes if none of them is in a class, else nothing; reads up to the first."""
+        found: set[str] = set()
+        for name in self.names if "detection" in self._tasks else ():
+            content = self._annotation(name)
+            if content is None:
+                continue
+            try:
+                items = [item for frame in content["frames"] for item in frame.get("objects") or ()]
+                found |= {str(item["category"]) for item in items if item.get("box2d") is not None}
+            except (KeyError, TypeError, AttributeError):
+                continue  # told when the sample is read
+            if found & self._table.keys():
+                return ()
+        return tuple(sorted(found))
+
     def __getitem__(self, index: int) -> Sample:
         """Read a sample.
 

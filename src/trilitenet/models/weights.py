@@ -21,7 +21,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from trilitenet.config import STRIDES, VARIANTS, Anchors, ModelCard, get_variant
+from trilitenet.config import STRIDES, VARIANTS, Anchors, ModelCard, get_variant, shipped_weights
 from trilitenet.errors import ConfigError, OutputError, WeightsError, replacing
 from trilitenet.models.trilitenet import TriLiteNet, build_network
 
@@ -32,13 +32,10 @@ __all__ = [
     "read_card",
     "resolve_weights",
     "save_network",
-    "shipped_weights",
 ]
 
 CARD_KEY: Final = "trilitenet.card"
 """Key of the card in the safetensors metadata."""
-
-_SHIPPED: Final = Path(__file__).parent.parent / "weights"
 
 _RENAMES: Final = (
     (r"model\.0\.level2_0\.c1\.conv\.", "encoder.level2_down.reduce."),
@@ -77,11 +74,6 @@ _RENAMES: Final = (
 
 _TRAINING_STATE: Final = frozenset({"schema", "config", "network", "optimiser"})
 """Keys that tell the training state of `trilitenet train` from other pickles."""
-
-
-def shipped_weights() -> dict[str, Path]:
-    """Return the weight files that come with the package, by variant name."""
-    return {path.stem: path for path in sorted(_SHIPPED.glob("*.safetensors"))}
 
 
 def resolve_weights(model: str | os.PathLike[str]) -> Path:
