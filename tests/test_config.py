@@ -51,6 +51,11 @@ def test_unusable_anchors_are_refused(anchors: tuple[tuple[tuple[float, float], 
         ModelCard("tiny", anchors=anchors)
 
 
+def test_an_input_that_no_network_takes_is_refused() -> None:
+    with pytest.raises(ConfigError, match="input_size must be multiples of 32, got 360x640"):
+        ModelCard("tiny", input_size=(360, 640))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -198,6 +198,7 @@ class ModelCard:
     schema: int = CARD_SCHEMA
 
     def __post_init__(self) -> None:
+        check_size(self.input_size, "input_size")
         check_anchors(self.anchors)
 
     @property

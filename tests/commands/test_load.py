@@ -40,6 +40,15 @@ def test_masks_that_are_decided_inside_take_no_thresholds(artefacts: Artefacts) 
         trilitenet.load(artefacts.folder / "model.onnx", drivable=0.7)
 
 
+@pytest.mark.parametrize(
+    ("backend", "format"),
+    [("onnxruntime", "onnx"), ("openvino", "openvino"), ("ncnn", "ncnn"), ("tensorrt", "tensorrt")],
+)
+def test_a_runtime_that_weights_do_not_run_on_tells_its_export(backend: str, format: str) -> None:
+    with pytest.raises(ConfigError, match=f"trilitenet export tiny --format {format}$"):
+        trilitenet.load("tiny", backend=backend)
+
+
 def test_mistakes_are_named(weights: Path) -> None:
     with pytest.raises(ConfigError, match="did you mean 'torch'"):
         trilitenet.load(weights, backend="toch")

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from tests.artefacts import SIZE, Artefacts
 from tests.deploy.networks import lively_network
@@ -14,7 +15,7 @@ from trilitenet.deploy.layouts import LAYOUTS, pick_layout
 from trilitenet.deploy.onnx import PORTABLE_OPERATORS, build_onnx, save_onnx
 from trilitenet.deploy.quantize import KEEP_STEPS, kept_nodes
 from trilitenet.deploy.tensorrt import trtexec_line
-from trilitenet.errors import ConfigError
+from trilitenet.errors import BackendError, ConfigError
 from trilitenet.processing.boxes import cxcywh_to_xyxy
 from trilitenet.processing.nms import nms
 
@@ -86,6 +87,17 @@ def test_dynamic_sizes_and_half_weights(tmp_path: Path) -> None:
         assert got.lane is not None
         assert wanted.lane is not None
         assert np.mean((got.lane > 0) == (wanted.lane > 127)) > 0.99
+
+
+def test_what_cannot_be_traced_is_one_plain_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_args: object, **_options: object) -> None:
+        cause = RuntimeError("Expected \x1b[1mshape[1] = 360\x1b[0m to be of the form 32*rows\n\nadvice")
+        raise torch.onnx.errors.OnnxExporterError("\x1b[96mThis is step 1/3\x1b[0m. Next steps:\n- ...") from cause
+
+    monkeypatch.setattr(torch.onnx, "export", fail)
+    network = lively_network()
+    with pytest.raises(BackendError, match=r"\(Expected shape\[1\] = 360 to be of the form 32\*rows\)$"):
+        build_onnx(DeployGraph(network, LAYOUTS["heads"]), network.card, ArtefactInfo("onnx"))
 
 
 def test_layouts_are_picked() -> None:

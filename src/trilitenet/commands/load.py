@@ -25,6 +25,8 @@ _RUNS: Final[dict[str, tuple[str, ...]]] = {
     ".engine": ("tensorrt",),
 }
 """Runtimes of a file by its suffix; others run on PyTorch."""
+_MADE: Final = {"onnxruntime": "onnx", "openvino": "openvino", "ncnn": "ncnn", "tensorrt": "tensorrt"}
+"""What to export for a runtime."""
 
 
 def load(
@@ -91,10 +93,9 @@ def _open(model: str | os.PathLike[str], device: str, backend: str, streams: int
             usable = ["onnxruntime"]
         backend = (usable or runs)[0]
     elif backend not in runs:
-        raise ConfigError(
-            f"{model} runs on {' or '.join(runs)}, not on {backend}"
-            + ("" if suffix in _RUNS else f"; make a file for it with: trilitenet export {model}")
-        )
+        cure = f"; make a file for it with: trilitenet export {model} --format {_MADE.get(backend)}"
+        exported = suffix in _RUNS or suffix == ".pt2"
+        raise ConfigError(f"{model} runs on {' or '.join(runs)}, not on {backend}{'' if exported else cure}")
     if backend == "openvino":
         from trilitenet.inference.openvino_backend import OpenVINOBackend
 

@@ -6,6 +6,7 @@ import ast
 import contextlib
 import logging
 import os
+import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -88,7 +89,7 @@ def build_onnx(
             assert program is not None
             model = program.model_proto
     except (RuntimeError, torch.onnx.errors.OnnxExporterError) as error:
-        raise BackendError(f"PyTorch cannot trace the deploy graph ({str(error).splitlines()[0]})") from error
+        raise BackendError(f"PyTorch cannot trace the deploy graph ({_reason(error)})") from error
     if nms is not None:
         _append_nms(onnx, model, card.classes, nms)
     if half:
@@ -110,6 +111,12 @@ def build_onnx(
 def save_onnx(model: Any, path: str | os.PathLike[str]) -> None:
     """Write an ONNX model to one file."""
     Path(path).write_bytes(model.SerializeToString())
+
+
+def _reason(error: BaseException) -> str:
+    """Return what the tracing failed of in one line; the exporter's own words are advice, in colours."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", str(error.__cause__ or error)).strip()
+    return text.split("\n", maxsplit=1)[0] or type(error).__name__
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -36,10 +37,17 @@ class ExportedTorchBackend:
         if not path.is_file():
             raise WeightsError(f"{path}: no such file")
         metadata: dict[str, Any] = {CARD_KEY: "", ARTEFACT_KEY: ""}
+        talker = logging.getLogger("torch.export")
+        level = talker.level
+        talker.setLevel(logging.ERROR)  # of a broken archive it logs a traceback
         try:
             program = torch.export.load(path, extra_files=metadata)
         except Exception as error:  # a broken archive fails in many ways
-            raise WeightsError(f"{path}: not a usable PyTorch program ({str(error).splitlines()[0][:160]})") from error
+            raise WeightsError(
+                f"{path}: not a usable PyTorch program (damaged, of another version of PyTorch, or another file)"
+            ) from error
+        finally:
+            talker.setLevel(level)
         found = {key: value.decode() if isinstance(value, bytes) else value for key, value in metadata.items() if value}
         self._card, self.info = read_metadata(found, str(path))
         self.device = pick_device("cpu" if device == "auto" else device)

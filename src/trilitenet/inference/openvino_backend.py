@@ -69,6 +69,9 @@ class OpenVINOBackend:
         # Checked here because OpenVINO tries every reader it has on a foreign file, and some of them talk.
         if not start.startswith(b"\x08" if path.suffix.lower() == ".onnx" else b"<"):
             raise WeightsError(f"{path}: not a usable OpenVINO or ONNX model (it does not begin as one)")
+        weights = path.with_suffix(".bin")
+        if path.suffix.lower() == ".xml" and not weights.is_file():
+            raise WeightsError(f"{path}: its weights are missing; keep {weights.name} beside it")
         with _FIRST_USE:
             core = _core(openvino)
         try:
