@@ -36,6 +36,22 @@ def test_texts_become_paths_where_paths_alone_are_meant() -> None:
         example(sources=[])  # type: ignore[call-arg]
 
 
+@text_paths
+def several(
+    sources: Sequence[str | Path],
+    *,
+    format: tuple[str, ...] = ("json",),
+    card: Sequence[Path] = (),
+    size: tuple[int, int] = (1, 2),
+) -> tuple[object, ...]:
+    return sources, format, card, size
+
+
+def test_one_text_stands_for_several() -> None:
+    assert several("a.jpg", format="coco", card="c.yaml") == (("a.jpg",), ("coco",), [Path("c.yaml")], (1, 2))  # type: ignore[arg-type]
+    assert several(Path("a.jpg"), format=("a", "b"))[:2] == ((Path("a.jpg"),), ("a", "b"))  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("command", "arguments", "options"),
     [

@@ -108,6 +108,12 @@ def test_the_command_line(folder: Path, tmp_path: Path, weights: Path, capsys: p
     assert "no source was given" in capsys.readouterr().err
 
 
+def test_texts_do_in_python(folder: Path, tmp_path: Path, predictor: Predictor) -> None:
+    report = predict_with(predictor, str(folder / "photo.jpg"), str(tmp_path / "out"), format="coco", hide="labels")  # type: ignore[arg-type]
+    assert report.images == 1
+    assert (tmp_path / "out" / "coco.json").is_file()
+
+
 def test_existing_results_are_refused_before_the_work_begins(
     folder: Path, tmp_path: Path, predictor: Predictor
 ) -> None:

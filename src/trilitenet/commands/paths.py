@@ -1,11 +1,12 @@
-"""Let text stand for a path in the Python API; the command line makes paths of its own."""
+"""Let text stand for a path, and one text for several, in the Python API; the command line makes its own."""
 
 from __future__ import annotations
 
 import functools
 import inspect
+import re
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, TypeVar, cast
 
 __all__ = ["text_paths"]
@@ -16,6 +17,8 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 def text_paths(function: _Function) -> _Function:
     """Return the function so that arguments annotated as paths, and not as texts too, may be texts.
 
+    Where several texts or paths are taken, one may be given as it is: its letters are not taken for several.
+
     Args:
         function: Of a module with postponed annotations.
     """
@@ -25,10 +28,18 @@ def text_paths(function: _Function) -> _Function:
         for name, parameter in signature.parameters.items()
         if "Path" in str(parameter.annotation) and "str" not in str(parameter.annotation)
     }
+    several = {
+        name
+        for name, parameter in signature.parameters.items()
+        if re.search(r"Sequence\[|tuple\[\w+, \.\.\.\]", str(parameter.annotation))
+    }
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         bound = signature.bind(*args, **kwargs)
+        for name in several & bound.arguments.keys():
+            if isinstance(bound.arguments[name], (str, PurePath)):
+                bound.arguments[name] = (bound.arguments[name],)
         for name in names & bound.arguments.keys():
             bound.arguments[name] = _as_path(bound.arguments[name])
         return function(*bound.args, **bound.kwargs)

@@ -201,6 +201,7 @@ def predict(
         return job.run(predictor, hide=hide, preview=preview, quiet=quiet, road=options)
 
 
+@text_paths
 def predict_with(
     predictor: Predictor,
     sources: Sequence[str | Path],
