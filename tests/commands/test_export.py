@@ -46,6 +46,9 @@ def test_options_that_do_not_fit(artefacts: Artefacts, tmp_path: Path) -> None:
         ({"precision": "int8"}, "--calibration"),
         ({"size": "100x64"}, "multiples of 32"),
         ({"size": "big"}, "HEIGHTxWIDTH"),
+        ({"size": (384, 640)}, r"HEIGHTxWIDTH such as 384x640, or dynamic, not \(384, 640\)"),
+        ({"format": "tflite"}, "unknown format 'tflite'; known: ncnn, onnx"),
+        ({"format": "onxx"}, "did you mean 'onnx'"),
         ({"format": "torch", "nms": True}, "--nms"),
         ({"portable": True, "nms": True}, "--portable keeps to operators"),
         ({"portable": True, "layout": "pixels"}, "--portable is planar"),
@@ -80,6 +83,18 @@ def test_pictures_are_never_masks(tmp_path: Path) -> None:
         find_pictures(tmp_path, 8, "train")
     (tmp_path / "images" / "val").rename(tmp_path / "images" / "train")
     assert [path.parent.name for path in find_pictures(tmp_path, 8, "val")] == ["train", "train"]
+
+
+def test_what_is_no_folder_of_pictures_is_told(tmp_path: Path) -> None:
+    (tmp_path / "photo.jpg").touch()
+    (tmp_path / "empty").mkdir()
+    for name, message in (
+        ("photo.jpg", "is a file; give a folder"),
+        ("absent", "no such folder"),
+        ("empty", "no pict"),
+    ):
+        with pytest.raises(InputError, match=message):
+            find_pictures(tmp_path / name, 8, "train")
 
 
 def test_a_dynamic_program_says_how_small_a_side_may_be(artefacts: Artefacts, tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ from trilitenet.deploy.quantize import KEEP_STEPS, quantize_onnx, quantize_openv
 from trilitenet.deploy.tensorrt import build_engine, is_installed, trtexec_line
 from trilitenet.deploy.triton import write_triton_repository
 from trilitenet.engine.evaluate import evaluate
-from trilitenet.errors import BackendError, ConfigError, InputError, OutputError, writing
+from trilitenet.errors import BackendError, ConfigError, InputError, OutputError, did_you_mean, writing
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.torch_backend import TorchBackend
@@ -166,6 +166,8 @@ def export(
         OutputError: If a file of the artefact exists (told before the work begins), or cannot be written.
         BackendError: If the comparison fails.
     """
+    if format not in PRECISIONS:
+        raise ConfigError(f"unknown format {format!r}{did_you_mean(format, PRECISIONS)}")
     if precision not in PRECISIONS[format]:
         raise ConfigError(f"{format} artefacts come as {', '.join(PRECISIONS[format])}, not {precision}")
     if nms and format not in ("onnx", "openvino", "triton"):
@@ -322,7 +324,7 @@ def _parse_size(size: str) -> tuple[int, int] | None:
     """Return (height, width), None for dynamic."""
     if size == "dynamic":
         return None
-    match = re.fullmatch(r"(\d+)x(\d+)", size)
+    match = re.fullmatch(r"(\d+)x(\d+)", str(size))  # two numbers, say, from Python
     if match is None:
         raise ConfigError(f"--size is HEIGHTxWIDTH such as 384x640, or dynamic, not {size!r}")
     canvas = int(match[1]), int(match[2])
@@ -346,8 +348,11 @@ def find_pictures(source: Path, count: int, split: str) -> list[Path]:
     """Return at most ``count`` pictures of a data set's split, or of a folder, spread evenly over what there is.
 
     Raises:
-        InputError: If there are none, or a data set has a val split and no train split that was asked for.
+        InputError: If there are none or no folder, or a data set has a val split and no train split that was asked for.
     """
+    if not source.is_dir():
+        what = "is a file; give a folder of pictures" if source.exists() else "no such folder"
+        raise InputError(f"{source}: {what}")
     images = source / "images"
     folder = images / split
     if not folder.is_dir():
