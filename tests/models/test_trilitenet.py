@@ -110,6 +110,8 @@ def test_bad_arguments_name_what_is_valid() -> None:
         build_network("tiny", tasks=("lanes",))
     with pytest.raises(ConfigError, match="at least 1"):
         build_network("tiny", classes=0)
+    with pytest.raises(ConfigError, match=r"anchors must be 3 levels of 3 sizes, got \[2\]"):
+        build_network("tiny", anchors=((1, 2),))  # type: ignore[arg-type]
 
 
 def test_decode_by_hand() -> None:

@@ -85,8 +85,10 @@ def test_a_damaged_state_is_never_loaded(saved: Path, change: str) -> None:
 def test_files_that_are_not_weights(tmp_path: Path, saved: Path) -> None:
     (tmp_path / "empty.safetensors").touch()
     (tmp_path / "text.safetensors").write_text("not weights at all")
+    (tmp_path / "model.onnx").write_bytes(b"\x08\x08 exported")
     (tmp_path / "cut.safetensors").write_bytes(saved.read_bytes()[:20_000])
     torch.save({"a": torch.zeros(1)}, tmp_path / "pickle.pth")
+    torch.save({"a": torch.zeros(1)}, tmp_path / "program.pt2")
     save_file({"a": torch.zeros(1)}, tmp_path / "foreign.safetensors")
     newer = dataclasses.replace(read_card(saved), schema=99)
     save_file(load_file(saved), tmp_path / "newer.safetensors", metadata={CARD_KEY: newer.to_json()})
@@ -95,6 +97,8 @@ def test_files_that_are_not_weights(tmp_path: Path, saved: Path) -> None:
         "text.safetensors": "not a safetensors file",
         "cut.safetensors": "truncated",
         "pickle.pth": "weights import",
+        "model.onnx": r"is an exported file, not weights; trilitenet\.load\(.*model\.onnx'\)\.card",
+        "program.pt2": "is an exported file",
         "foreign.safetensors": "no trilitenet card",
         "newer.safetensors": "upgrade trilitenet",
         "absent.safetensors": "does not exist",

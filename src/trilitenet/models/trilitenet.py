@@ -22,6 +22,7 @@ from trilitenet.config import (
     Anchors,
     ModelCard,
     Task,
+    check_anchors,
     check_tasks,
     get_variant,
 )
@@ -73,6 +74,7 @@ class TriLiteNet(nn.Module):
         anchors: Anchors,
     ) -> None:
         super().__init__()
+        check_anchors(anchors)
         config = get_variant(variant)
         c0, c1, c2, c3, c4 = config.channels
         self.variant = variant
@@ -170,7 +172,7 @@ def build_network(
         anchors: (width, height) in input pixels, three a level; defaults to `DEFAULT_ANCHORS`.
 
     Raises:
-        ConfigError: On an unknown variant or task, or fewer than one class.
+        ConfigError: On an unknown variant or task, fewer than one class, or unusable anchors.
     """
     if classes < 1:
         raise ConfigError(f"classes must be at least 1, got {classes}")

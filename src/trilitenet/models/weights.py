@@ -72,6 +72,9 @@ _RENAMES: Final = (
 )
 """Published key prefixes and ours; the first match wins."""
 
+_ARTEFACTS: Final = frozenset({".onnx", ".xml", ".param", ".engine", ".pt2"})
+"""Endings of exported files, which hold no weights to load."""
+
 _TRAINING_STATE: Final = frozenset({"schema", "config", "network", "optimiser"})
 """Keys that tell the training state of `trilitenet train` from other pickles."""
 
@@ -247,6 +250,10 @@ def _open(path: Path, *, tensors: bool) -> tuple[ModelCard, dict[str, Tensor]]:
             keys = list(file.keys()) if tensors else []
             return card, {key: file.get_tensor(key) for key in keys}
     except SafetensorError as error:
+        if path.suffix.lower() in _ARTEFACTS:
+            raise WeightsError(
+                f"{path}: is an exported file, not weights; trilitenet.load({str(path)!r}).card tells what it is"
+            ) from error
         if _is_pickle(path):
             raise WeightsError(_about_pickle(path)) from error
         raise WeightsError(f"{path}: is not a safetensors file, or is truncated ({error})") from error
