@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import re
 import shutil
 from pathlib import Path
@@ -100,3 +101,13 @@ def test_a_table_is_filled_and_what_is_done_is_kept(artefacts: Artefacts, tmp_pa
     evaluate_table(weights, precisions=("fp32",), **settings)  # type: ignore[arg-type]
     changed = {path.name for path in before if path.stat().st_mtime_ns != before[path]}
     assert changed == {"report.json", "report.html"}
+
+
+def test_figures_without_a_value_hide_no_loss() -> None:
+    key, other = "fair/detection/ap50", "paper/lane/iou"
+    rows = [
+        PrecisionRow("a", precision, "x", {key: math.nan, other: value})
+        for precision, value in (("fp32", 0.3), ("int8", 0.2))
+    ]
+    lost, figure = PrecisionTable(tuple(rows)).drop(rows[1])
+    assert (round(lost, 9), figure) == (10.0, other)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import multiprocessing
 import os
 import re
@@ -21,6 +22,7 @@ import trilitenet
 from trilitenet.commands.train import train
 from trilitenet.commands.train_table import train_table
 from trilitenet.config import TASKS
+from trilitenet.data.description import read_description, write_description
 from trilitenet.data.prepared import prepare
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.synthetic_files import write_dataset
@@ -107,6 +109,41 @@ def test_resume_is_bit_for_bit(scenes: Path, tmp_path: Path) -> None:
         assert result.steps == steps
     same(state(tmp_path / "straight"), state(tmp_path / "parts"))
     assert curves(tmp_path / "straight") == curves(tmp_path / "parts")
+
+
+@pytest.mark.slow
+def test_resume_is_bit_for_bit_with_validation_between(scenes: Path, tmp_path: Path) -> None:
+    for steps in (3, 6):
+        train(resume=steps > 3, **settings(scenes, tmp_path / "parts", max_steps=steps, val_split="val"))
+    train(**settings(scenes, tmp_path / "straight", max_steps=6, val_split="val"))
+    same(state(tmp_path / "straight"), state(tmp_path / "parts"))
+
+
+def test_initial_weights_keep_their_anchors(scenes: Path, tmp_path: Path) -> None:
+    train(**settings(scenes, tmp_path, init="tiny", max_steps=1, auto_anchor=True, anchor_recall=0.0))
+    assert load_network(tmp_path / "final.safetensors").card.anchors == load_network("tiny").card.anchors
+
+
+def test_an_epoch_without_a_step_is_refused(scenes: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="an epoch of 1 batches has no step of 4"):
+        train(**settings(scenes, tmp_path, samples_per_epoch=1, accumulate=4))
+
+
+def test_resuming_takes_the_new_weight_decay(scenes: Path, tmp_path: Path) -> None:
+    train(**settings(scenes, tmp_path, max_steps=1))
+    train(resume=True, **settings(scenes, tmp_path, max_steps=2, weight_decay=0.3, betas=(0.5, 0.6)))
+    groups = read_checkpoint(tmp_path / "last.ckpt")["optimiser"]["param_groups"]
+    assert max(group["weight_decay"] for group in groups) == 0.3
+    assert {tuple(group["betas"]) for group in groups} == {(0.5, 0.6)}
+
+
+def test_a_teacher_of_other_classes_is_refused_before_anything_is_made(scenes: Path, tmp_path: Path) -> None:
+    data = shutil.copytree(scenes, tmp_path / "data")
+    classes = {"car": ("car",), "lorry": ("truck",)}
+    write_description(data, dataclasses.replace(read_description(data), classes=classes))
+    with pytest.raises(ConfigError, match="the teacher tells 1 classes, the data set has 2"):
+        train(**settings(data, tmp_path / "run", teacher="tiny"))
+    assert not (tmp_path / "run").exists()
 
 
 def test_pixels_reach_the_network_unrounded_in_bf16(

@@ -148,3 +148,9 @@ def test_settings_are_checked(dataset: DrivingDataset) -> None:
     for weights in (np.ones(3), np.zeros(14), -np.ones(14)):
         with pytest.raises(ConfigError, match="weights must be 14"):
             build_loader(dataset, EvalTransform(CANVAS), batch_size=1, weights=weights)
+
+
+def test_no_process_is_left_without_an_image(dataset: DrivingDataset) -> None:
+    with pytest.raises(ConfigError, match="2 of 14 images are left for a last batch, too few for 3 processes"):
+        build_loader(dataset, EvalTransform(CANVAS), batch_size=6, shuffle=False, share=(0, 3))
+    assert len(build_loader(dataset, EvalTransform(CANVAS), batch_size=6, share=(0, 3))) == 2

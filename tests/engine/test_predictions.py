@@ -70,6 +70,14 @@ def test_predictions_are_not_overwritten_unasked(tmp_path: Path) -> None:
     PredictionWriter(tmp_path, ("detection",), overwrite=True).close()
 
 
+def test_nothing_of_another_model_is_left(tmp_path: Path) -> None:
+    PredictionWriter(tmp_path, ("detection", "lane")).close()
+    (tmp_path / "lane" / "a.png").write_bytes(b"")
+    (tmp_path / "notes.txt").write_text("mine")
+    PredictionWriter(tmp_path, ("drivable",), overwrite=True).close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["drivable", "notes.txt"]
+
+
 def test_a_part_that_is_not_there_is_a_task_that_is_not_scored(tmp_path: Path) -> None:
     (tmp_path / "lane").mkdir()
     cv2.imwrite(str(tmp_path / "lane" / "a.png"), np.full((4, 4), 7, np.uint8))

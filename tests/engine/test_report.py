@@ -127,6 +127,15 @@ def test_reports_of_other_images_or_labels_are_not_paired(report: Report) -> Non
     assert not comparison.differences
     assert "other images" in comparison.unpaired["b"]
     assert "other images under the same names" in comparison.unpaired["c"]
+    settings = {**report.provenance.settings, "paper_batch": 3}
+    batches = dataclasses.replace(report, provenance=dataclasses.replace(report.provenance, settings=settings))
+    fair = report.state["fair"]
+    renamed = {**report.state, "fair": {**fair, "detection": {**fair["detection"], "class_names": ["lorry"]}}}
+    comparison = compare_reports(
+        {"a": report, "b": batches, "c": dataclasses.replace(report, state=renamed)}, resamples=10
+    )
+    assert "batches of 3" in comparison.unpaired["b"]
+    assert "tells lorry" in comparison.unpaired["c"]
     with pytest.raises(ConfigError, match="at least one"):
         compare_reports({})
 

@@ -106,3 +106,14 @@ def test_uncertainty_weighting_takes_an_image_without_any_loss() -> None:
     outputs, batch = case()
     loss = MultiTaskLoss(None, balancing="uncertainty")
     assert loss(outputs._replace(drivable=None, lane=None), batch).total.item() == 0.0
+
+
+def test_uncertainty_weighting_learns_nothing_of_a_task_without_labels() -> None:
+    outputs, batch = case()
+    bare = dataclasses.replace(batch, lane=torch.full_like(batch.lane, 255))
+    loss = MultiTaskLoss(DetectionLoss(ANCHORS, 1), balancing="uncertainty")
+    loss(outputs, bare).total.backward()
+    (parameter,) = loss.parameters()
+    assert parameter.grad is not None
+    assert parameter.grad[2] == 0
+    assert (parameter.grad[:2] != 0).all()

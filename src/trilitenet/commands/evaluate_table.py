@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Literal
@@ -78,8 +79,9 @@ class PrecisionTable:
         """Return by how many points a row is at most below the first row of its model, and in which figure."""
         first = self._first(row)
         lost = {key: 100 * (first.figures[key] - row.figures[key]) for key in (*_PAPER, *_FAIR) if key in row.figures}
-        worst = max(lost, key=lambda key: lost[key])
-        return lost[worst], worst
+        lost = {key: value for key, value in lost.items() if not math.isnan(value)}  # as for a task without labels
+        worst = max(lost, key=lambda key: lost[key], default="")
+        return lost.get(worst, 0.0), worst
 
     def summary(self) -> str:
         """Return two tables in Markdown: the paper's columns by its protocol, and those of the fair one."""

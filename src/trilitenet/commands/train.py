@@ -174,11 +174,14 @@ def _transform(config: TrainConfig, dataset: SampleSource, display: _Display) ->
 def _network(config: TrainConfig, dataset: SampleSource, display: _Display, *, resume: bool) -> TriLiteNet:
     """Build the network: anchors, initial weights, frozen parts."""
     anchors = config.anchors
+    initial = load_network(config.init) if config.init is not None and not resume else None
     if config.auto_anchor and anchors is None and "detection" in config.tasks and not resume:
         swapped = config.swapped_anchors
         sizes = box_sizes(dataset, config.input_size, seed=config.seed, swapped=swapped)
         enough = math.inf if swapped else config.anchor_recall
-        fit = fit_anchors(sizes, DEFAULT_ANCHORS, enough=enough, seed=config.seed)
+        # Weights that are taken over were trained with anchors of their own: those are kept where they fit.
+        before = DEFAULT_ANCHORS if initial is None or "detection" not in initial.tasks else initial.card.anchors
+        fit = fit_anchors(sizes, before, enough=enough, seed=config.seed)
         display.line(fit.summary())
         anchors = fit.anchors
     network = build_network(
@@ -190,9 +193,9 @@ def _network(config: TrainConfig, dataset: SampleSource, display: _Display, *, r
         spp=config.spp,
         anchors=anchors,
     )
-    if config.init is not None and not resume:
+    if initial is not None:
         fitted = network.anchors.clone()
-        display.line(f"{config.init}: {initialise(network, load_network(config.init)).summary()}")
+        display.line(f"{config.init}: {initialise(network, initial).summary()}")
         if anchors is not None:
             network.anchors.copy_(fitted)
     freeze(network, config.freeze)
@@ -241,6 +244,9 @@ def _teacher(config: TrainConfig, network: TriLiteNet) -> tuple[TriLiteNet, Dist
     teacher = load_network(config.teacher)
     if not set(teacher.tasks) & set(network.tasks):
         raise ConfigError(f"{config.teacher}: the teacher has none of the tasks {', '.join(network.tasks)}")
+    classes = len(teacher.card.class_names), len(network.card.class_names)
+    if "detection" in teacher.tasks and "detection" in network.tasks and classes[0] != classes[1]:
+        raise ConfigError(f"{config.teacher}: the teacher tells {classes[0]} classes, the data set has {classes[1]}")
     return teacher, DistillationLoss(network.anchors, teacher.anchors, config.distillation)
 
 

@@ -259,6 +259,11 @@ def build_loader(
         weights = None if (own == own[0]).all() else own
     if weights is not None and (weights.shape != (len(dataset),) or not (weights >= 0).all() or not weights.any()):
         raise ConfigError(f"weights must be {len(dataset)} numbers, none negative and one above 0")
+    length = samples_per_epoch or len(dataset)
+    drop_last = (shuffle and length >= batch_size) if drop_last is None else drop_last
+    rest = length % batch_size
+    if 0 < rest < share[1] and not drop_last:
+        raise ConfigError(f"{rest} of {length} images are left for a last batch, too few for {share[1]} processes")
     return Loader(
         dataset,
         transform,
@@ -267,7 +272,7 @@ def build_loader(
         shuffle=shuffle,
         weights=weights,
         samples_per_epoch=samples_per_epoch,
-        drop_last=(shuffle and (samples_per_epoch or len(dataset)) >= batch_size) if drop_last is None else drop_last,
+        drop_last=drop_last,
         workers=workers,
         pin_memory=pin_memory,
         share=share,

@@ -185,6 +185,12 @@ def _why_unpaired(first: Report, other: Report) -> str:
     for part, value in first.provenance.data_sha256.items():
         if other.provenance.data_sha256.get(part, value) != value:
             return f"measured with other {part} under the same names; no paired differences"
+    batches = [report.provenance.settings.get("paper_batch") for report in (first, other)]
+    if None not in batches and batches[0] != batches[1]:
+        return f"published averages over batches of {batches[1]}, the first of {batches[0]}; no paired differences"
+    classes = [report.state.get("fair", {}).get("detection", {}).get("class_names") for report in (first, other)]
+    if None not in classes and classes[0] != classes[1]:
+        return f"tells {', '.join(classes[1])}, the first {', '.join(classes[0])}; no paired differences"
     return ""
 
 

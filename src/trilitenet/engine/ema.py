@@ -30,17 +30,18 @@ class MovingAverage:
         self.decay = decay
         self.ramp = ramp
         self.updates = 0
-        self._averaged, self._copied = _tensors(self.network)
 
     @torch.no_grad()
     def update(self, network: nn.Module) -> None:
         """Take in the network's current weights."""
         self.updates += 1
         decay = self.decay * (1 - math.exp(-self.updates / self.ramp)) if self.ramp else self.decay
+        # Looked up anew: a change of memory format, as validation makes, gives the average's parameters new tensors.
+        own, own_copied = _tensors(self.network)
         averaged, copied = _tensors(network)
-        torch._foreach_lerp_(self._averaged, averaged, 1 - decay)
+        torch._foreach_lerp_(own, averaged, 1 - decay)
         if copied:
-            torch._foreach_copy_(self._copied, copied)
+            torch._foreach_copy_(own_copied, copied)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state as plain values and tensors."""

@@ -71,7 +71,7 @@ class TensorBoardLogger:
 
     def __init__(self, folder: Path, step: int = 0) -> None:
         module: Any = import_extra("torch.utils.tensorboard", "train")
-        self._writer = module.SummaryWriter(str(folder), purge_step=step or None)
+        self._writer = module.SummaryWriter(str(folder), purge_step=step + 1 if step else None)
 
     def log(self, values: Mapping[str, float], step: int) -> None:
         """Take named figures of a step."""

@@ -15,6 +15,7 @@ from __future__ import annotations
 import array
 import json
 import re
+import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -55,6 +56,11 @@ class PredictionWriter:
             raise OutputError(f"{folder}: holds {held[0]} already; give another folder or --overwrite")
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
+            # Another model's predictions would be taken for this one's.
+            (folder / DETECTIONS_FILE).unlink(missing_ok=True)
+            for name in ("drivable", "lane"):
+                if (folder / name).is_dir():
+                    shutil.rmtree(folder / name)
             for task in self._tasks:
                 if task != "detection":
                     (folder / task).mkdir(exist_ok=True)

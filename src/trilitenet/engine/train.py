@@ -27,7 +27,7 @@ from trilitenet.engine.recipe import TrainConfig
 from trilitenet.engine.rescale import draw_size, rescale
 from trilitenet.engine.runtime import StopRequest
 from trilitenet.engine.transfer import keep_frozen
-from trilitenet.errors import WeightsError, brief, writing
+from trilitenet.errors import ConfigError, WeightsError, brief, writing
 from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.losses.multitask import LossTerms, MultiTaskLoss
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
@@ -170,6 +170,11 @@ class Trainer:
         self.guard = FiniteGuard(self.network, optimiser, 20 if fabric.device.type == "cuda" else 1)
 
         self.epoch_steps = len(loader) // config.accumulate
+        if not self.epoch_steps:
+            raise ConfigError(
+                f"an epoch of {len(loader)} batches has no step of {config.accumulate}; "
+                "lower --accumulate or --batch-size"
+            )
         steps = config.epochs * self.epoch_steps
         self.steps = min(steps, config.max_steps) if config.max_steps else steps
         warmup = max(round(config.warmup_epochs * self.epoch_steps), config.warmup_steps if config.warmup_epochs else 0)
@@ -357,7 +362,7 @@ class Trainer:
         return bool(self.fabric.all_reduce(wish, reduce_op="sum") > 0)
 
     def _log_losses(self, epoch: int, sums: Tensor, rate: float, speed: float) -> None:
-        *means, _ = (sums / sums[-1].clamp(min=1)).tolist()
+        *means, _ = (sums / sums[-1]).tolist()  # NaN where every step was left out
         losses = dict(zip(LossTerms._fields, means, strict=True))
         figures = {f"train/{name}": value for name, value in losses.items()}
         self._tell(figures | {"lr": rate, "images_per_second": speed})
@@ -432,7 +437,10 @@ class Trainer:
         if self.ema is not None:
             # A run without an average that goes on with one: it begins at the weights as they are.
             self.ema.load_state_dict(state["ema"] or {"updates": 0, "network": state["network"]})
+        settings = [(group["weight_decay"], group["betas"]) for group in self.optimiser.param_groups]
         self.optimiser.load_state_dict(state["optimiser"])
+        for group, (weight_decay, betas) in zip(self.optimiser.param_groups, settings, strict=True):
+            group.update(weight_decay=weight_decay, betas=betas)  # as this run says, like the learning rate
         self.loss.load_state_dict(state["loss"])
         if state.get("scaler"):
             self.fabric._precision.load_state_dict(state["scaler"])

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from trilitenet.losses.detection import DetectionLoss
-from trilitenet.losses.segmentation import SegmentationLoss
+from trilitenet.losses.segmentation import IGNORED, SegmentationLoss
 
 __all__ = ["LossTerms", "MultiTaskLoss", "Outputs", "Targets"]
 
@@ -102,21 +102,21 @@ class MultiTaskLoss(nn.Module):
         """Compute the loss of one batch, in 32-bit floats whatever the autocast."""
         zero = torch.zeros((), device=batch.detection_labelled.device)
         terms = [zero] * 7
-        present = [False, False, False]
+        present = [zero.bool()] * 3  # without a label in the batch, a task's weight learns nothing
         if outputs.detection is not None and self.detection is not None:
             terms[0:3] = self.detection(outputs.detection, batch.boxes, batch.ignored, batch.detection_labelled)
-            present[0] = True
+            present[0] = batch.detection_labelled.any()
         if outputs.drivable is not None:
             terms[3:5] = self.drivable(outputs.drivable, batch.drivable)
-            present[1] = True
+            present[1] = (batch.drivable != IGNORED).any()
         if outputs.lane is not None:
             terms[5:7] = self.lane(outputs.lane, batch.lane)
-            present[2] = True
+            present[2] = (batch.lane != IGNORED).any()
         weights: list[float | Tensor] = list(self.weights)
         extra = zero
         if self.log_variance is not None:
             weights = [weight * torch.exp(-s) for weight, s in zip(self.weights, self.log_variance, strict=True)]
-            extra = (self.log_variance * torch.tensor(present, device=zero.device)).sum()
+            extra = (self.log_variance * torch.stack(present)).sum()
         task = (0, 0, 0, 1, 1, 2, 2)
         parts = [term * weights[index] for term, index in zip(terms, task, strict=True)]
         total = torch.stack(parts).sum() + extra
