@@ -10,7 +10,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -140,7 +139,7 @@ def test_resuming_takes_the_new_weight_decay(scenes: Path, tmp_path: Path) -> No
 
 def test_a_teacher_of_other_classes_is_refused_before_anything_is_made(scenes: Path, tmp_path: Path) -> None:
     data = shutil.copytree(scenes, tmp_path / "data")
-    classes: dict[str, Sequence[str]] = {"car": ("car",), "lorry": ("truck",)}
+    classes: dict[str, tuple[str, ...]] = {"car": ("car",), "lorry": ("truck",)}
     write_description(data, dataclasses.replace(read_description(data), classes=classes))
     with pytest.raises(ConfigError, match="the teacher tells 1 classes, the data set has 2"):
         train(**settings(data, tmp_path / "run", teacher="tiny"))

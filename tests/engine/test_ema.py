@@ -55,10 +55,11 @@ def test_is_apart_from_the_network() -> None:
 
 def test_goes_on_after_a_change_of_memory_format() -> None:
     """Validation lays the average out channels-last, which gives (C, 1, 1, 1) weights new tensors."""
-    network = nn.Sequential(nn.Conv2d(4, 4, 1, groups=4, bias=False))
+    network = nn.Conv2d(4, 4, 1, groups=4, bias=False)
     ema = MovingAverage(network, decay=0.5, ramp=0)
     ema.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    before = ema.network[0].weight.clone()  # type: ignore[index]
-    network[0].weight.data.add_(1)
+    (average,) = ema.network.parameters()
+    before = average.clone()
+    network.weight.data.add_(1)
     ema.update(network)
-    torch.testing.assert_close(ema.network[0].weight, before + 0.5)  # type: ignore[index]
+    torch.testing.assert_close(next(ema.network.parameters()), before + 0.5)
