@@ -62,7 +62,7 @@ def make(variant: str, batch: Batch, *, plain: bool, bf16: bool, device: str) ->
     masks = (PlainMaskLoss(0.7, 0.3), PlainMaskLoss(0.9, 0.1)) if plain else (None, None)
     loss = MultiTaskLoss(DetectionLoss(network.anchors, 1), *masks).to(device)
     if plain:
-        optimiser = torch.optim.AdamW(network.parameters(), 1e-3, foreach=False)
+        optimiser = torch.optim.AdamW(network.parameters(), 1e-3)
     else:
         optimiser = build_optimiser([network], lr=1e-3, betas=(0.937, 0.999), weight_decay=0.01)
     ema = MovingAverage(network)

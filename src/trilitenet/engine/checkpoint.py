@@ -50,7 +50,9 @@ def write_checkpoint(path: str | Path, state: dict[str, Any]) -> None:
             file.flush()
             os.fsync(file.fileno())
     except (OSError, RuntimeError) as error:
-        raise OutputError(f"{path}: cannot write the checkpoint ({error})") from error
+        # Where the disk is full, PyTorch's own error comes on top of the one that says so.
+        reason = error.__context__ if isinstance(error.__context__, OSError) else error
+        raise OutputError(f"{path}: cannot write the checkpoint ({reason})") from error
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:

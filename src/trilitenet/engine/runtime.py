@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import datetime
 import logging
 import signal
 import sys
 import threading
 from types import FrameType, TracebackType
-from typing import Any
+from typing import Any, Final
 
 import torch
 
@@ -21,6 +22,9 @@ log = logging.getLogger(__name__)
 
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4
 """Options of glibc's mallopt."""
+
+_PATIENCE: Final = datetime.timedelta(days=1)
+"""Processes wait so long for each other."""
 
 
 def pick_precision(precision: str, device: str) -> str:
@@ -72,6 +76,10 @@ def make_fabric(device: str = "auto", precision: str = "auto", **options: Any) -
         keep_freed_memory()
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     settings = {"devices": 1, **options}
+    if settings["devices"] != 1 or settings.get("num_nodes", 1) != 1:
+        # The other processes wait while the first validates, which on a CPU takes longer than the default half an hour.
+        strategies = import_extra("lightning_fabric.strategies", "train")
+        settings.setdefault("strategy", strategies.DDPStrategy(timeout=_PATIENCE))
     try:
         fabric = lightning.Fabric(accelerator=accelerator, precision=pick_precision(precision, accelerator), **settings)
     except (ValueError, TypeError) as error:

@@ -372,8 +372,9 @@ class Trainer:
             self.display.step(self.step, self.steps, text)
 
     def _tell(self, values: Mapping[str, float]) -> None:
-        for logger in self.loggers:
-            logger.log(values, self.step)
+        with writing(self.folder):
+            for logger in self.loggers:
+                logger.log(values, self.step)
 
     def _show(self, text: str) -> None:
         if self.display is not None and self.fabric.is_global_zero:
