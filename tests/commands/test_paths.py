@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 import trilitenet
+from trilitenet.commands.evaluate import check_output
 from trilitenet.commands.paths import text_paths
-from trilitenet.errors import ConfigError, DataError, TriLiteNetError
+from trilitenet.errors import ConfigError, DataError, OutputError, TriLiteNetError
 
 
 @text_paths
@@ -81,3 +82,9 @@ def test_every_command_takes_texts(
 def test_export_takes_texts() -> None:
     with pytest.raises((ConfigError, DataError)):
         trilitenet.export("tiny", precision="int8", output="x.onnx", calibration_frames=-1, calibration="nowhere")  # type: ignore[arg-type]
+
+
+def test_a_report_that_cannot_be_written_is_told_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="cannot be written"):
+        check_output(tmp_path / "file" / "report", overwrite=True)

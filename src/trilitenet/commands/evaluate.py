@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from trilitenet.commands.load import load
-from trilitenet.commands.paths import text_paths
+from trilitenet.commands.paths import check_writable, text_paths
 from trilitenet.config import ArtefactInfo, shipped_weights
 from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER, DrivingDataset
 from trilitenet.engine.evaluate import EvaluatedPredictor
@@ -232,13 +232,15 @@ def check_counts(resamples: int, worst: int = 0, limit: int | None = None) -> No
 
 
 def check_output(output: Path | None, overwrite: bool) -> None:
-    """Refuse, before hours of work, a folder that holds a report.
+    """Refuse, before hours of work, a folder that holds a report or cannot be written.
 
     Raises:
-        OutputError: If it does.
+        OutputError: If it is so.
     """
     if output is not None and not overwrite and (output / "report.json").exists():
         raise OutputError(f"{output}: holds report.json already; give another folder or --overwrite")
+    if output is not None:
+        check_writable(output / "report.json")
 
 
 def write_report(report: Report, output: Path | None) -> None:

@@ -14,12 +14,11 @@ from trilitenet.commands.export import (
     PRECISIONS,
     SUFFIXES,
     Precision,
-    check_writable,
     drop_frames,
     export,
     find_pictures,
 )
-from trilitenet.commands.paths import text_paths
+from trilitenet.commands.paths import check_writable, text_paths
 from trilitenet.commands.tables import markdown_row
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.provenance import hash_files

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-import os
 import re
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from torch.nn.functional import interpolate
 
 import trilitenet
-from trilitenet.commands.paths import text_paths
+from trilitenet.commands.paths import check_writable, text_paths
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, MAX_STRIDE, ArtefactInfo, Task, check_size
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.deploy.graph import DeployGraph, Masks
@@ -47,7 +46,6 @@ __all__ = [
     "SUFFIXES",
     "Exported",
     "Precision",
-    "check_writable",
     "drop_frames",
     "export",
     "find_pictures",
@@ -279,25 +277,6 @@ def export(
             return dataclasses.replace(exported, notes=notes)
         reason = f"{drop:.2f} points lost, at most {max_drop} allowed"
     raise BackendError(f"{path}: not written, INT8 costs too much even with most layers in floating point ({reason})")
-
-
-def check_writable(path: Path) -> None:
-    """Refuse, before any work, a file whose place is taken by a folder, or that no folder can be made for.
-
-    Raises:
-        OutputError: If it is so.
-    """
-    with writing(path):
-        folder = next((parent for parent in path.parents if parent.exists()), Path())
-        reason = ""
-        if not folder.is_dir():
-            reason = f"{folder} is no folder"
-        elif path.is_dir():
-            reason = "it is a folder"
-        elif not os.access(folder, os.W_OK | os.X_OK):
-            reason = f"no permission to write in {folder}"
-    if reason:
-        raise OutputError(f"{path}: cannot be written ({reason})")
 
 
 def _check_files(path: Path, format: Format, overwrite: bool) -> None:

@@ -1,15 +1,18 @@
-"""Let text stand for a path, and one text for several, in the Python API; the command line makes its own."""
+"""Paths of commands: text stands for one, and one for several, in the Python API; whether one can be written."""
 
 from __future__ import annotations
 
 import functools
 import inspect
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path, PurePath
 from typing import Any, TypeVar, cast
 
-__all__ = ["text_paths"]
+from trilitenet.errors import OutputError, writing
+
+__all__ = ["check_writable", "text_paths"]
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -51,3 +54,22 @@ def _as_path(value: Any) -> Any:
     if isinstance(value, str):
         return Path(value)
     return [_as_path(one) for one in value] if isinstance(value, (list, tuple)) else value
+
+
+def check_writable(path: Path) -> None:
+    """Refuse, before any work, a file whose place is taken by a folder, or that no folder can be made for.
+
+    Raises:
+        OutputError: If it is so.
+    """
+    with writing(path):
+        folder = next((parent for parent in path.parents if parent.exists()), Path())
+        reason = ""
+        if not folder.is_dir():
+            reason = f"{folder} is no folder"
+        elif path.is_dir():
+            reason = "it is a folder"
+        elif not os.access(folder, os.W_OK | os.X_OK):
+            reason = f"no permission to write in {folder}"
+    if reason:
+        raise OutputError(f"{path}: cannot be written ({reason})")
