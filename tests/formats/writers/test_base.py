@@ -6,6 +6,7 @@ import importlib
 import json
 import signal
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -78,14 +79,21 @@ def test_output_that_is_a_file_is_an_error(tmp_path: Path, pictures: list[Percep
         writer.write(pictures[0])
 
 
+@pytest.fixture
+def ctrl_c() -> Iterator[Any]:
+    """Python's own answer to Ctrl-C, which a process that a shell put into the background lacks."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield signal.default_int_handler
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize(
     ("name", "step"),
     [("coco", "coco.encode_mask"), ("cvat", "cvat.cvat_mask"), ("openlabel", "base.dumps"), ("scalabel", "base.dumps")],
 )
 def test_ctrl_c_waits_until_a_result_is_whole(
-    name: str, step: str, tmp_path: Path, pictures: list[Perception], monkeypatch: pytest.MonkeyPatch
+    name: str, step: str, tmp_path: Path, pictures: list[Perception], monkeypatch: pytest.MonkeyPatch, ctrl_c: Any
 ) -> None:
-    handler = signal.getsignal(signal.SIGINT)
     steps = 0
 
     def write() -> None:
@@ -106,7 +114,7 @@ def test_ctrl_c_waits_until_a_result_is_whole(
     with pytest.raises(KeyboardInterrupt):
         write()
     assert steps
-    assert signal.getsignal(signal.SIGINT) is handler
+    assert signal.getsignal(signal.SIGINT) is ctrl_c
     if name == "openlabel":
         assert all(len(json.loads(path.read_text())["openlabel"]["frames"]) == 1 for path in tmp_path.glob("*.json"))
     elif name == "cvat":
