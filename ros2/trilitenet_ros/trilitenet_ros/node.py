@@ -44,8 +44,7 @@ class PerceptionNode(Node):
             backend=self.declare_parameter("backend", "auto").value,
             confidence=None if confidence < 0 else confidence,
         )
-        self._camera = read_camera(camera_file) if camera_file else None
-        self._monitor = RoadMonitor(self._camera)
+        self._monitor = RoadMonitor(read_camera(camera_file) if camera_file else None)
         self._start: float | None = None
         self._frame = 0
         self._detections = self.create_publisher(Detection2DArray, "~/detections", 1)
@@ -73,12 +72,7 @@ class PerceptionNode(Node):
                     self._masks[name].publish(fill_mask(mask, message.header, TYPES))
         header = copy.deepcopy(message.header)
         header.frame_id = self._vehicle_frame
-        try:
-            lines = self._monitor(perception).ego_lines
-        except ValueError:
-            self._monitor = RoadMonitor(self._camera)  # this one has taken the picture's size for checked
-            raise
-        for publisher, line in zip(self._lanes, lines, strict=True):
+        for publisher, line in zip(self._lanes, self._monitor(perception).ego_lines, strict=True):
             path = None if line is None else fill_path(line, header, TYPES)
             if path is not None:
                 publisher.publish(path)

@@ -28,12 +28,12 @@ from trilitenet.engine.predictions import SavedPredictions
 from trilitenet.engine.provenance import describe_hardware, describe_versions, peak_memory
 from trilitenet.engine.report import Provenance, Report
 from trilitenet.engine.scorecard import CONDITIONS, PAPER_THRESHOLDS, Scorecard, protocols_of
-from trilitenet.engine.scoring import CanvasPrediction, LabelledImage, on_own_car
+from trilitenet.engine.scoring import CanvasPrediction, LabelledImage, add_boxes
 from trilitenet.errors import ConfigError, DataError
 from trilitenet.metrics.detection import DetectionMetric
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.processing.postprocess import select_boxes, threshold_mask
-from trilitenet.structures import Boxes, Perception, RawOutputs
+from trilitenet.structures import Perception, RawOutputs
 
 __all__ = [
     "LOWEST_CONFIDENCE",
@@ -441,16 +441,7 @@ def best_thresholds(
 
     def look(sample: LabelledImage, raw: RawOutputs, index: int, letterbox: Letterbox) -> None:
         if raw.detection is not None:
-            boxes: Boxes = select_boxes(raw.detection[index], letterbox, low)
-            detection.update(
-                boxes.xyxy,
-                boxes.confidence,
-                boxes.class_id,
-                sample.boxes,
-                sample.class_id,
-                sample.ignored,
-                on_own_car(sample, boxes.xyxy),
-            )
+            add_boxes(detection, sample, select_boxes(raw.detection[index], letterbox, low))
         pairs: tuple[tuple[Literal["drivable", "lane"], NDArray[np.uint8] | None, NDArray[np.uint8] | None], ...] = (
             ("drivable", raw.drivable, sample.drivable),
             ("lane", raw.lane, sample.lane),

@@ -32,7 +32,7 @@ __all__ = [
     "LabelledImage",
     "PaperMetrics",
     "PaperScores",
-    "on_own_car",
+    "add_boxes",
 ]
 
 
@@ -60,20 +60,28 @@ class LabelledImage(Protocol):
     def attributes(self) -> dict[str, str]: ...  # noqa: D102
 
 
-def on_own_car(sample: LabelledImage, boxes: NDArray[np.floating] | None) -> NDArray[np.bool_] | None:
-    """Return which predicted boxes lie by more than half on the own car; None = none does.
+def add_boxes(metric: DetectionMetric, sample: LabelledImage, boxes: Boxes | None) -> tuple[int, int, int] | None:
+    """Add an image to a detection metric: boxes that lie by more than half on the own car are not wrong.
 
     Args:
+        metric: To add to.
         sample: The labels.
-        boxes: (D, 4) predicted xyxy px of the sample's image, or None.
+        boxes: Predicted, in pixels of the sample's image; None if the model gave none.
 
     Returns:
-        (D,) bool.
+        See `DetectionMetric.update`.
     """
-    if sample.valid is None or boxes is None or not len(boxes):
-        return None
-    sums = cv2.integral((~sample.valid).view(np.uint8))
-    height, width = sample.valid.shape
+    labels = sample.boxes, sample.class_id, sample.ignored
+    if boxes is None:
+        return metric.update(None, None, None, *labels)
+    neutral = None if sample.valid is None or not len(boxes) else _on_own_car(sample.valid, boxes.xyxy)
+    return metric.update(boxes.xyxy, boxes.confidence, boxes.class_id, *labels, neutral)
+
+
+def _on_own_car(valid: NDArray[np.bool_], boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Return which (D, 4) xyxy px boxes lie by more than half where (H, W) ``valid`` is False."""
+    sums = cv2.integral((~valid).view(np.uint8))
+    height, width = valid.shape
     corners = np.rint(boxes).clip(0, (width, height, width, height)).astype(np.intp)
     left, top, right, bottom = corners.T
     own = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
@@ -153,16 +161,7 @@ class FairMetrics:
         detection = drivable = lane = None
         right = wrong = missed = 0
         if self.detection is not None:
-            boxes = prediction.boxes
-            counts = self.detection.update(
-                None if boxes is None else boxes.xyxy,
-                None if boxes is None else boxes.confidence,
-                None if boxes is None else boxes.class_id,
-                sample.boxes,
-                sample.class_id,
-                sample.ignored,
-                on_own_car(sample, None if boxes is None else boxes.xyxy),
-            )
+            counts = add_boxes(self.detection, sample, prediction.boxes)
             if counts is not None:
                 right, wrong, missed = counts
                 if sum(counts):
