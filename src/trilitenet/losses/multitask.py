@@ -102,22 +102,30 @@ class MultiTaskLoss(nn.Module):
         """Compute the loss of one batch, in 32-bit floats whatever the autocast."""
         zero = torch.zeros((), device=batch.detection_labelled.device)
         terms = [zero] * 7
-        present = [zero.bool()] * 3  # without a label in the batch, a task's weight learns nothing
         if outputs.detection is not None and self.detection is not None:
             terms[0:3] = self.detection(outputs.detection, batch.boxes, batch.ignored, batch.detection_labelled)
-            present[0] = batch.detection_labelled.any()
         if outputs.drivable is not None:
             terms[3:5] = self.drivable(outputs.drivable, batch.drivable)
-            present[1] = (batch.drivable != IGNORED).any()
         if outputs.lane is not None:
             terms[5:7] = self.lane(outputs.lane, batch.lane)
-            present[2] = (batch.lane != IGNORED).any()
         weights: list[float | Tensor] = list(self.weights)
         extra = zero
         if self.log_variance is not None:
             weights = [weight * torch.exp(-s) for weight, s in zip(self.weights, self.log_variance, strict=True)]
-            extra = (self.log_variance * torch.stack(present)).sum()
+            extra = (self.log_variance * self._labelled(outputs, batch)).sum()
         task = (0, 0, 0, 1, 1, 2, 2)
         parts = [term * weights[index] for term, index in zip(terms, task, strict=True)]
         total = torch.stack(parts).sum() + extra
         return LossTerms(total, *parts)
+
+    def _labelled(self, outputs: Outputs, batch: Targets) -> Tensor:
+        """Return (3,) bool: the tasks that the batch has a label of; the weights of the others learn nothing."""
+        missing = torch.zeros((), dtype=torch.bool, device=batch.detection_labelled.device)
+        has_boxes = outputs.detection is not None and self.detection is not None
+        return torch.stack(
+            [
+                batch.detection_labelled.any() if has_boxes else missing,
+                missing if outputs.drivable is None else (batch.drivable != IGNORED).any(),
+                missing if outputs.lane is None else (batch.lane != IGNORED).any(),
+            ]
+        )
