@@ -68,6 +68,8 @@ def main() -> None:
     parser.add_argument("--input-size", type=int, nargs=2, default=(384, 640))
     options = parser.parse_args()
     dataset, canvas = DrivingDataset(options.data, "train"), EvalTransform(tuple(options.input_size))
+    if len(dataset) < options.batch:
+        parser.error(f"{options.data}: {len(dataset)} frames are fewer than --batch {options.batch}")
     stride = len(dataset) // options.batch
     batch = collate([canvas(dataset[index * stride]) for index in range(options.batch)])
     for variant in options.variants:

@@ -78,6 +78,8 @@ def test_reports_are_compared(run: tuple[Report, Path], data: Path, tmp_path: Pa
         compare(folder, output=tmp_path)
     with pytest.raises(ConfigError, match="at least one"):
         compare()
+    with pytest.raises(ConfigError, match=r"report\.json: given more than once"):
+        compare(folder, tmp_path / "scored", folder / "report.json")
 
 
 def test_reports_are_not_overwritten_unasked(run: tuple[Report, Path], data: Path, weights: Path) -> None:
@@ -189,7 +191,7 @@ def test_an_artefact_that_suppresses_boxes_is_not_measured(artefacts: Artefacts,
 
 def test_a_file_of_bytes_is_no_report_in_one_short_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "weights.bin").write_bytes(b"\x01\x00\x00\x00\xff\xff\xff\xff" * 10_000)
-    assert main(["compare", str(tmp_path / "weights.bin"), str(tmp_path / "weights.bin")]) == 1
+    assert main(["compare", str(tmp_path / "weights.bin")]) == 1
     message = capsys.readouterr().err
     assert "not a report" in message
     assert "UnicodeDecodeError" in message

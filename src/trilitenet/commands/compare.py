@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 from trilitenet.commands.evaluate import check_counts
@@ -32,15 +33,23 @@ def compare(
 
     Returns:
         The comparison.
+
+    Raises:
+        ConfigError: If there is no report, or one is given twice.
+        OutputError: If the output holds a comparison, or cannot be written.
     """
     if not reports:
         raise ConfigError("give at least one report.json, or a folder that holds one")
     check_counts(resamples)
     if output is not None and not overwrite and (output / "comparison.json").exists():
         raise OutputError(f"{output}: holds comparison.json already; give another folder or --overwrite")
+    files = [path / "report.json" if path.is_dir() else path for path in reports]
+    repeated = [path for path, count in Counter(file.resolve() for file in files).items() if count > 1]
+    if repeated:
+        raise ConfigError(f"{repeated[0]}: given more than once; give each report once")
     named: dict[str, Report] = {}
-    for path in reports:
-        report = read_report(path / "report.json" if path.is_dir() else path)
+    for path, file in zip(reports, files, strict=True):
+        report = read_report(file)
         name = Path(report.provenance.model).name or report.provenance.model
         if name in named:
             name = f"{name} ({path})"
