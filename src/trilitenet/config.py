@@ -21,6 +21,7 @@ from trilitenet.errors import ConfigError, WeightsError, did_you_mean
 __all__ = [
     "ARTEFACT_KEY",
     "ARTEFACT_SCHEMA",
+    "ARTEFACT_SUFFIXES",
     "CARD_KEY",
     "CARD_SCHEMA",
     "DEFAULT_ANCHORS",
@@ -232,6 +233,14 @@ WEIGHTS_HASH_KEY: Final = "trilitenet.weights_sha256"
 """Key of the SHA-256 of an artefact's weights, where these and the metadata are files of their own."""
 ARTEFACT_SCHEMA: Final = 1
 """Version of the artefact's description; a file with a higher one is refused."""
+ARTEFACT_SUFFIXES: Final = {
+    "onnx": ".onnx",
+    "openvino": ".xml",
+    "ncnn": ".ncnn.param",
+    "tensorrt": ".engine",
+    "torch": ".pt2",
+}
+"""What the file of an exported format ends with."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,6 @@ from typing import Final, Literal
 from trilitenet.commands.evaluate import evaluate, hash_dataset, hash_model
 from trilitenet.commands.export import (
     PRECISIONS,
-    SUFFIXES,
     Precision,
     drop_frames,
     export,
@@ -20,6 +19,7 @@ from trilitenet.commands.export import (
 )
 from trilitenet.commands.paths import check_writable, text_paths
 from trilitenet.commands.tables import markdown_row
+from trilitenet.config import ARTEFACT_SUFFIXES
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.provenance import hash_files
 from trilitenet.engine.report import Report, read_report
@@ -170,7 +170,7 @@ def evaluate_table(
         stamp = (hash_model(model) or "")[:12]
         for precision in precisions:
             name = f"{Path(model).stem}-{stamp}-{size}-{precision}{int8 if precision == 'int8' else ''}"
-            artefact = output / f"{name}{SUFFIXES[format]}"
+            artefact = output / f"{name}{ARTEFACT_SUFFIXES[format]}"
             report = None if overwrite else _done(output / name / "report.json", artefact, data_hash)
             if report is None:
                 if overwrite or not artefact.exists():

@@ -18,7 +18,7 @@ from torch.nn.functional import interpolate
 
 import trilitenet
 from trilitenet.commands.paths import check_writable, text_paths
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY, MAX_STRIDE, ArtefactInfo, Task, check_size
+from trilitenet.config import ARTEFACT_KEY, ARTEFACT_SUFFIXES, CARD_KEY, MAX_STRIDE, ArtefactInfo, Task, check_size
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.deploy.graph import DeployGraph, Masks
 from trilitenet.deploy.layouts import pick_layout
@@ -43,7 +43,6 @@ from trilitenet.structures import RawOutputs
 __all__ = [
     "DROP_FRAMES",
     "PRECISIONS",
-    "SUFFIXES",
     "Exported",
     "Precision",
     "drop_frames",
@@ -55,14 +54,6 @@ Format = Literal["onnx", "openvino", "ncnn", "tensorrt", "torch", "triton"]
 Precision = Literal["fp32", "fp16", "bf16", "int8"]
 _Item = TypeVar("_Item")
 
-SUFFIXES = {
-    "onnx": ".onnx",
-    "openvino": ".xml",
-    "ncnn": ".ncnn.param",
-    "tensorrt": ".engine",
-    "torch": ".pt2",
-}
-"""What the file of a format ends with."""
 PRECISIONS = {
     "onnx": ("fp32", "fp16", "int8"),
     "openvino": ("fp32", "fp16", "bf16", "int8"),
@@ -194,9 +185,10 @@ def export(
     if format == "triton":
         path = (output or Path("model_repository")) / Path(model).stem
     else:
-        path = output or Path(f"{Path(model).stem}{SUFFIXES[format]}")
-        if not path.name.endswith(SUFFIXES[format]) and not (format == "tensorrt" and path.name):
-            raise ConfigError(f"{format} artefacts end with {SUFFIXES[format]}, not {path.suffix or 'nothing'}")
+        ending = ARTEFACT_SUFFIXES[format]
+        path = output or Path(f"{Path(model).stem}{ending}")
+        if not path.name.endswith(ending) and not (format == "tensorrt" and path.name):
+            raise ConfigError(f"{format} artefacts end with {ending}, not {path.suffix or 'nothing'}")
     _check_files(path, format, overwrite)
     network = load_network(model).eval()
     if nms and "detection" not in network.tasks:

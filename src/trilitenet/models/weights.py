@@ -21,7 +21,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from trilitenet.config import STRIDES, VARIANTS, Anchors, ModelCard, get_variant, shipped_weights
+from trilitenet.config import ARTEFACT_SUFFIXES, STRIDES, VARIANTS, Anchors, ModelCard, get_variant, shipped_weights
 from trilitenet.errors import ConfigError, OutputError, WeightsError, replacing
 from trilitenet.models.trilitenet import TriLiteNet, build_network
 
@@ -71,9 +71,6 @@ _RENAMES: Final = (
     (r"model\.5\.", "lane.out."),
 )
 """Published key prefixes and ours; the first match wins."""
-
-_ARTEFACTS: Final = frozenset({".onnx", ".xml", ".param", ".engine", ".pt2"})
-"""Endings of exported files, which hold no weights to load."""
 
 _TRAINING_STATE: Final = frozenset({"schema", "config", "network", "optimiser"})
 """Keys that tell the training state of `trilitenet train` from other pickles."""
@@ -250,7 +247,7 @@ def _open(path: Path, *, tensors: bool) -> tuple[ModelCard, dict[str, Tensor]]:
             keys = list(file.keys()) if tensors else []
             return card, {key: file.get_tensor(key) for key in keys}
     except SafetensorError as error:
-        if path.suffix.lower() in _ARTEFACTS:
+        if path.name.lower().endswith(tuple(ARTEFACT_SUFFIXES.values())):
             raise WeightsError(
                 f"{path}: is an exported file, not weights; trilitenet.load({str(path)!r}).card tells what it is"
             ) from error
