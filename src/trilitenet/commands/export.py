@@ -155,40 +155,10 @@ def export(
         OutputError: If a file of the artefact exists (told before the work begins), or cannot be written.
         BackendError: If the comparison fails.
     """
-    if format not in PRECISIONS:
-        raise ConfigError(f"unknown format {format!r}{did_you_mean(format, PRECISIONS)}")
-    if precision not in PRECISIONS[format]:
-        raise ConfigError(f"{format} artefacts come as {', '.join(PRECISIONS[format])}, not {precision}")
-    if nms and format not in ("onnx", "openvino", "triton"):
-        raise ConfigError("--nms is for onnx, openvino and triton")
-    if nms and portable:
-        raise ConfigError("--portable keeps to operators that --nms needs more than; choose one of them")
-    if precision == "int8" and calibration is None:
-        raise ConfigError("int8 needs --calibration: a data set in the published layout, or a folder of road frames")
-    if calibration_frames < 1:
-        raise ConfigError(f"--calibration-frames must be at least 1, got {calibration_frames}")
-    if max_drop is not None and precision != "int8":
-        raise ConfigError("--max-drop is for --precision int8")
-    if format in ("ncnn", "tensorrt"):
-        portable = True
-    if portable and layout != "auto" and not layout.startswith("planar"):
-        raise ConfigError(f"--portable is planar, as are ncnn and tensorrt; leave --layout {layout} out")
+    portable = portable or format in ("ncnn", "tensorrt")
     parsed = _parse_size(size)
-    if precision == "int8" and parsed is None:
-        raise ConfigError("int8 needs a fixed --size")
-    if format == "ncnn" and parsed is None:
-        raise ConfigError("ncnn needs a fixed --size")
-    if portable and masks not in (None, "logit"):
-        raise ConfigError(
-            f"masks of ncnn, tensorrt and --portable are logits; give --masks logit or leave it out, not {masks}"
-        )
-    if format == "triton":
-        path = (output or Path("model_repository")) / Path(model).stem
-    else:
-        ending = ARTEFACT_SUFFIXES[format]
-        path = output or Path(f"{Path(model).stem}{ending}")
-        if not path.name.endswith(ending) and not (format == "tensorrt" and path.name):
-            raise ConfigError(f"{format} artefacts end with {ending}, not {path.suffix or 'nothing'}")
+    _check_options(format, precision, parsed, calibration, calibration_frames, max_drop, nms, portable, masks, layout)
+    path = _destination(model, format, output)
     _check_files(path, format, overwrite)
     network = load_network(model).eval()
     if nms and "detection" not in network.tasks:
@@ -237,8 +207,7 @@ def export(
         mask_scale=mask_scale,
         bgr=bgr,
     )
-    canvas = parsed or network.card.input_size
-    checks = _canvases(frames or calibration, canvas, 8)
+    checks = _canvases(frames or calibration, parsed or network.card.input_size, 8)
     if format == "torch":
         return _export_torch(network, graph, info, path, checks)
     if format == "ncnn":
@@ -247,28 +216,58 @@ def export(
     proto = build_onnx(graph, network.card, info, nms=thresholds, half=format == "onnx" and precision == "fp16")
     if format == "tensorrt":
         return _export_tensorrt(network, proto, info, path, checks)
-
     built: Any = build_openvino(proto) if format == "openvino" else proto
-    if precision != "int8":
+    if calibration is None or precision != "int8":
         return _keep(network, built, info, path, checks)
-    assert calibration is not None
-    inputs = [_as_input(image, info) for image in _canvases(calibration, canvas, calibration_frames, split="train")]
-    budget = None if max_drop is None else _Drop(network, info.size, calibration)
-    quantize = quantize_openvino if format == "openvino" else quantize_onnx
-    reason = ""
-    for keep in KEEP_STEPS if budget else KEEP_STEPS[1:2]:
-        candidate = quantize(built, inputs, keep)
-        with tempfile.TemporaryDirectory() as folder:
-            trial = Path(folder) / path.name
-            _write(candidate, trial, network, info)
-            drop = budget.measure(_open(trial, info)) if budget else 0.0
-        if max_drop is None or drop <= max_drop:
-            exported = _keep(network, candidate, info, path, checks)
-            kept = f"in floating point: {', '.join(keep) or 'attention and depthwise convolutions only'}"
-            notes = (kept,) if max_drop is None else (kept, f"largest drop on val: {drop:.2f} points")
-            return dataclasses.replace(exported, notes=notes)
-        reason = f"{drop:.2f} points lost, at most {max_drop} allowed"
-    raise BackendError(f"{path}: not written, INT8 costs too much even with most layers in floating point ({reason})")
+    return _export_int8(network, built, info, path, checks, calibration, calibration_frames, max_drop)
+
+
+def _check_options(
+    format: Format,
+    precision: Precision,
+    size: tuple[int, int] | None,
+    calibration: Path | None,
+    calibration_frames: int,
+    max_drop: float | None,
+    nms: bool,
+    portable: bool,
+    masks: Masks | None,
+    layout: str,
+) -> None:
+    """Refuse options that do not fit each other."""
+    if format not in PRECISIONS:
+        raise ConfigError(f"unknown format {format!r}{did_you_mean(format, PRECISIONS)}")
+    if precision not in PRECISIONS[format]:
+        raise ConfigError(f"{format} artefacts come as {', '.join(PRECISIONS[format])}, not {precision}")
+    if nms and format not in ("onnx", "openvino", "triton"):
+        raise ConfigError("--nms is for onnx, openvino and triton")
+    if nms and portable:
+        raise ConfigError("--portable keeps to operators that --nms needs more than; choose one of them")
+    if precision == "int8" and calibration is None:
+        raise ConfigError("int8 needs --calibration: a data set in the published layout, or a folder of road frames")
+    if calibration_frames < 1:
+        raise ConfigError(f"--calibration-frames must be at least 1, got {calibration_frames}")
+    if max_drop is not None and precision != "int8":
+        raise ConfigError("--max-drop is for --precision int8")
+    if portable and layout != "auto" and not layout.startswith("planar"):
+        raise ConfigError(f"--portable is planar, as are ncnn and tensorrt; leave --layout {layout} out")
+    if size is None and (precision == "int8" or format == "ncnn"):
+        raise ConfigError(f"{'int8' if precision == 'int8' else format} needs a fixed --size")
+    if portable and masks not in (None, "logit"):
+        raise ConfigError(
+            f"masks of ncnn, tensorrt and --portable are logits; give --masks logit or leave it out, not {masks}"
+        )
+
+
+def _destination(model: str, format: Format, output: Path | None) -> Path:
+    """Return the file to write; for triton, the folder of the model in the repository."""
+    if format == "triton":
+        return (output or Path("model_repository")) / Path(model).stem
+    ending = ARTEFACT_SUFFIXES[format]
+    path = output or Path(f"{Path(model).stem}{ending}")
+    if not path.name.endswith(ending) and not (format == "tensorrt" and path.name):
+        raise ConfigError(f"{format} artefacts end with {ending}, not {path.suffix or 'nothing'}")
+    return path
 
 
 def _check_files(path: Path, format: Format, overwrite: bool) -> None:
@@ -482,6 +481,37 @@ class _Drop:
             figures = evaluate(predictor, self._dataset, resamples=0, worst=0, by=()).figures
         values = {key: figures[key].value for key in self._keys if key in figures}
         return {key: value for key, value in values.items() if math.isfinite(value)}
+
+
+def _export_int8(
+    network: TriLiteNet,
+    built: Any,
+    info: ArtefactInfo,
+    path: Path,
+    checks: Sequence[NDArray[np.uint8]],
+    calibration: Path,
+    calibration_frames: int,
+    max_drop: float | None,
+) -> Exported:
+    """Quantise, and leave more and more parts in floating point until no score loses more than ``max_drop`` points."""
+    canvas = info.size or network.card.input_size
+    inputs = [_as_input(image, info) for image in _canvases(calibration, canvas, calibration_frames, split="train")]
+    budget = None if max_drop is None else _Drop(network, info.size, calibration)
+    quantize = quantize_openvino if info.format == "openvino" else quantize_onnx
+    reason = ""
+    for keep in KEEP_STEPS if budget else KEEP_STEPS[1:2]:
+        candidate = quantize(built, inputs, keep)
+        with tempfile.TemporaryDirectory() as folder:
+            trial = Path(folder) / path.name
+            _write(candidate, trial, network, info)
+            drop = budget.measure(_open(trial, info)) if budget else 0.0
+        if max_drop is None or drop <= max_drop:
+            exported = _keep(network, candidate, info, path, checks)
+            kept = f"in floating point: {', '.join(keep) or 'attention and depthwise convolutions only'}"
+            notes = (kept,) if max_drop is None else (kept, f"largest drop on val: {drop:.2f} points")
+            return dataclasses.replace(exported, notes=notes)
+        reason = f"{drop:.2f} points lost, at most {max_drop} allowed"
+    raise BackendError(f"{path}: not written, INT8 costs too much even with most layers in floating point ({reason})")
 
 
 def _export_torch(
