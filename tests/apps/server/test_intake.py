@@ -100,27 +100,28 @@ def test_another_format_than_its_header_is_refused() -> None:
 
 def test_memory_is_given_back() -> None:
     budget = MemoryBudget(100)
-    with Reservation(budget) as first:
-        first.take(60)
-        with Reservation(budget) as second:
-            second.take(40)
-            with pytest.raises(BusyError):
-                second.take(1)
-            assert budget.used == 100
-        assert budget.used == 60
+    first, second = Reservation(budget), Reservation(budget)
+    first.take(60)
+    second.take(40)
+    with pytest.raises(BusyError):
+        second.take(1)
+    assert budget.used == 100
+    second.keep(0)
+    assert budget.used == 60
+    first.keep(0)
     assert budget.used == 0
 
 
 def test_a_request_that_never_fits_is_told_so() -> None:
-    with Reservation(MemoryBudget(100)) as reservation:
-        reservation.take(60)
-        with pytest.raises(ProblemError, match="more than 100 bytes") as caught:
-            reservation.take(41)
-        assert caught.value.status == 413
-        reservation.keep(10)
-        assert reservation.budget.used == 10
-        reservation.keep(50)
-        assert reservation.budget.used == 10
+    reservation = Reservation(MemoryBudget(100))
+    reservation.take(60)
+    with pytest.raises(ProblemError, match="more than 100 bytes") as caught:
+        reservation.take(41)
+    assert caught.value.status == 413
+    reservation.keep(10)
+    assert reservation.budget.used == 10
+    reservation.keep(50)
+    assert reservation.budget.used == 10
 
 
 def test_what_follows_a_jpeg_is_no_part_of_it() -> None:
@@ -157,5 +158,5 @@ def test_endless_segments_are_refused() -> None:
     data = encode(picture(61, 47), "JPEG")
     for place in (2, len(data) - 2):
         with pytest.raises(ProblemError, match="segments") as caught:
-            read_header(data[:place] + b"\xff\xfe\x00\x02" * 10_000 + data[place:])
+            read_header(data[:place] + b"\xff\xfe\x00\x02" * 1_000 + data[place:])
         assert caught.value.status == 413
