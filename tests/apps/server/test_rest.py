@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import asyncio
 import io
 import json
 from typing import Any
@@ -12,6 +13,7 @@ from starlette.testclient import TestClient
 from tests.apps.server.conftest import TOKEN, FakeBackend, MakeApp, encode, picture
 from trilitenet.apps.server.application import Application, create_app
 from trilitenet.apps.server.guard import PUBLIC_PATHS
+from trilitenet.apps.server.intake import Header, read_header
 from trilitenet.apps.server.openapi import BatchPrediction, Prediction, ProtocolErrorAnswer
 from trilitenet.config import ArtefactInfo
 from trilitenet.inference.predictor import Predictor
@@ -110,6 +112,23 @@ def test_a_batch_gives_each_image_its_own_status(client: TestClient, jpeg: bytes
     results = answer.json()["results"]
     assert [result["status"] for result in results] == [200, 415, 200, 422]
     assert results[2]["perception"]["size"] == {"height": 64, "width": 32}
+
+
+def test_the_headers_of_a_batch_leave_others_their_turn(
+    client: TestClient, jpeg: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    others: list[int] = []
+    meanwhile: list[int] = []
+
+    def look(data: bytes) -> Header:
+        meanwhile.append(len(others))
+        asyncio.get_running_loop().call_soon(others.append, 1)
+        return read_header(data)
+
+    monkeypatch.setattr("trilitenet.apps.server.rest.read_header", look)
+    files = [("images", (f"{index}.jpg", jpeg)) for index in range(4)]
+    assert client.post("/v1/predict/batch", files=files).status_code == 200
+    assert meanwhile == [0, 1, 2, 3]
 
 
 def test_a_batch_has_a_largest_size(make_app: MakeApp, jpeg: bytes) -> None:

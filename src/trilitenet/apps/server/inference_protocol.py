@@ -14,6 +14,7 @@ import json
 import struct
 from collections.abc import Sequence
 from contextlib import nullcontext
+from itertools import chain
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -37,7 +38,21 @@ _HEADER_LENGTH: Final = "inference-header-content-length"
 _VERSION: Final = "1"
 
 _MAX_VALUES: Final = 1_500_000
-"""Values in the JSON of a request: parsing more would hold Python's lock for too long. 640 x 480 pixels fit."""
+"""Values in the JSON of a request: 640 x 480 pixels fit, as one list or in lists of lists."""
+
+_MAX_LISTS: Final = 400_000
+"""Lists and objects among them: Python's lock is held while they are parsed, unless there are numbers between."""
+
+_MAX_QUOTES: Final = 10_000
+"""Quotation marks in the JSON of a request: objects of very many names would hold the lock for a second."""
+
+_MAX_DIGITS: Final = 20
+"""Characters of a whole number: the time that one takes grows with the square of its length."""
+
+_NO_PIXELS: Final = "data must hold whole numbers from 0 to 255"
+
+_SLICE: Final = 2**16
+"""Numbers that are checked at once: between two slices other threads get their turn."""
 
 _MAX_MASK_PIXELS: Final = 4_000_000
 """Pixels of all images of a request whose masks are wanted as JSON."""
@@ -157,16 +172,20 @@ def _json_memory(body: bytes, split: int) -> int:
     Raises:
         ProblemError: 413 if they hold too many values.
     """
-    plain = nested = 0
+    plain = nested = quotes = 0
     for start in range(0, split, 2**20):
         end = min(start + 2**20, split)
         plain += body.count(b",", start, end)
         nested += body.count(b"[", start, end) + body.count(b"{", start, end)
-        if plain + nested > _MAX_VALUES:
+        quotes += body.count(b'"', start, end)
+        if quotes > _MAX_QUOTES:
+            raise ProblemError(413, "too_many_values", f"the JSON holds more than {_MAX_QUOTES // 2:,} texts and names")
+        if plain + nested > _MAX_VALUES or nested > _MAX_LISTS:
             raise ProblemError(
                 413,
                 "too_many_values",
-                f"the JSON holds more than {_MAX_VALUES:,} values: send the tensor in binary form",
+                f"the JSON holds more than {_MAX_VALUES:,} values, or {_MAX_LISTS:,} lists: send the tensor in binary "
+                "form",
             )
     return 8 * split + 64 * plain + 256 * nested  # text of four bytes a letter, twice; a number each; a list each
 
@@ -178,7 +197,8 @@ def _parse(body: bytes, split: int, names: Sequence[str], settings: Settings) ->
         ProblemError: 400 if it is malformed, 413 if an image is too large.
     """
     try:
-        mapping = json.loads(body[:split])
+        # A function of Python for each number: C code would not let other threads run before the end.
+        mapping = json.loads(body[:split], parse_int=_whole, parse_float=lambda text: float(text))
     except (ValueError, RecursionError) as error:
         raise _bad("the request is not JSON") from error
     if not isinstance(mapping, dict):
@@ -263,27 +283,53 @@ def _pixels(
     data = _binary(tensor, rest)
     try:
         if data is None:
-            # As objects: texts of several lengths would each take as much as the longest.
-            values = np.asarray(tensor.get("data"), object)
-            kinds = set(map(type, values.flat))
-            if list in kinds:
-                raise ValueError
-            if kinds - {int} or (values.size and not (values.min() >= 0 and values.max() <= 255)):
-                raise _bad("data must hold whole numbers from 0 to 255")
-            array = values.astype(np.uint8)
-        else:
-            array = np.frombuffer(data, np.uint8)
-        array = array.reshape(count, height, width, 3)
+            data = _numbers(tensor.get("data"))
+        array = np.frombuffer(data, np.uint8).reshape(count, height, width, 3)
     except ValueError as error:
         raise _bad(f"the data does not fill the shape {shape}") from error
     return list(array), (height, width)
+
+
+def _whole(text: str) -> int:
+    if len(text) > _MAX_DIGITS:
+        raise _bad(f"a number of more than {_MAX_DIGITS} digits")
+    return int(text)
+
+
+def _numbers(values: Any) -> bytes:
+    """Return the numbers of a list, or of lists of equally long lists, a byte each.
+
+    Raises:
+        ProblemError: 400 if there is anything but whole numbers from 0 to 255.
+        ValueError: If the lists are not equally long.
+    """
+    if not isinstance(values, list):
+        raise _bad(_NO_PIXELS)
+    while values and isinstance(values[0], list):
+        length = len(values[0])
+        if not all(isinstance(row, list) and len(row) == length for row in values):
+            raise ValueError
+        values = list(chain.from_iterable(values))
+    numbers = bytearray()
+    for start in range(0, len(values), _SLICE):
+        part = values[start : start + _SLICE]
+        kinds = set(map(type, part))
+        if list in kinds:
+            raise ValueError
+        if kinds - {int}:
+            raise _bad(_NO_PIXELS)
+        try:
+            numbers += bytes(part)
+        except ValueError:
+            raise _bad(_NO_PIXELS) from None
+    return bytes(numbers)
 
 
 def _files(
     tensor: dict[str, Any], shape: list[int], rest: bytes, settings: Settings
 ) -> tuple[list[Encoded | NDArray[np.uint8]], tuple[int, int]]:
     data = _binary(tensor, rest)
-    files = _base64(tensor.get("data")) if data is None else _length_prefixed(data)
+    files = _base64(tensor.get("data")) if data is None else _length_prefixed(data, settings.max_images)
     if shape not in ([len(files)], [len(files), 1]) or not files:
         raise _bad(f"the shape is {shape[:8]}, {len(files)} encoded images came")
     images: list[Encoded | NDArray[np.uint8]] = []
@@ -307,10 +353,13 @@ def _base64(data: Any) -> list[bytes]:
         raise _bad("data is not base64") from error
 
 
-def _length_prefixed(data: bytes) -> list[bytes]:
-    files = []
+def _length_prefixed(data: bytes, most: int) -> list[bytes]:
+    """Split encoded images that each follow their length, a number of four bytes."""
+    files: list[bytes] = []
     position = 0
     while position < len(data):
+        if len(files) == most:
+            raise _bad(f"the binary data holds more than {most} encoded images")
         if position + 4 > len(data):
             raise _bad("the binary data ends early")
         (length,) = struct.unpack_from("<I", data, position)

@@ -157,6 +157,7 @@ async def _all_images(request: Request, service: Service, reservation: Reservati
             if problem.status == 503:
                 raise
             checked.append(_refusal(problem))
+        await asyncio.sleep(0)  # the headers of many images take a while: others get their turn between
     return checked
 
 
