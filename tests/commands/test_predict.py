@@ -304,6 +304,13 @@ def test_names_that_two_formats_want_are_refused(tmp_path: Path, predictor: Pred
     assert predict_with(predictor, [pictures], tmp_path / "out", format=("jsonl", "coco")).exit_code == 0
 
 
+def test_a_picture_may_be_called_like_a_video(tmp_path: Path, predictor: Predictor) -> None:
+    Image.fromarray(coloured_scene()).save(tmp_path / "drive.jpg")
+    sources = [drive(tmp_path / "drive.mp4"), tmp_path / "drive.jpg"]
+    assert predict_with(predictor, sources, tmp_path / "out", format=("yolo",), overlay=False).exit_code == 0
+    assert {"drive-0000000.txt", "drive-2.txt"} <= {path.name for path in (tmp_path / "out/labels").iterdir()}
+
+
 @pytest.mark.parametrize(
     ("format", "there"),
     [

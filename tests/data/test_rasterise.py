@@ -117,7 +117,7 @@ def test_bad_shapes_are_refused() -> None:
         flatten([[0, 0], [1, 1]], "L", closed=False)
     with pytest.raises(DataError, match="one letter"):
         flatten([[0, 0], [1, 1]], "LX", closed=False)
-    for wrong in (float("nan"), float("inf")):
+    for wrong in (float("nan"), float("inf"), 1e9):
         points = np.array([[0, 0], [wrong, 1], [3, 3]])
         with pytest.raises(DataError, match="not a number"):
             flatten(points.tolist(), "LLL", closed=False)

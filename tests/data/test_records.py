@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from trilitenet.data.records import CocoRuns, ImageRecord, ListedRecords, RowRuns
+from trilitenet.data.records import CocoRuns, ImageRecord, ListedRecords, RowRuns, image_size
 from trilitenet.errors import DataError
 from trilitenet.processing.serialise import encode_mask
 
@@ -46,6 +47,12 @@ def test_runs_of_every_kind_agree() -> None:
 def test_runs_that_do_not_fit_are_refused(runs: CocoRuns | RowRuns) -> None:
     with pytest.raises(DataError):
         runs.decode(SIZE)
+
+
+@pytest.mark.parametrize("exif", [b"no TIFF at all", b"II*\0"])
+def test_a_damaged_exif_leaves_the_size_readable(tmp_path: Path, exif: bytes) -> None:
+    Image.new("RGB", (60, 40)).save(tmp_path / "a.png", exif=exif)
+    assert image_size(tmp_path / "a.png") == (40, 60)
 
 
 def test_two_images_of_one_name_are_both_named() -> None:

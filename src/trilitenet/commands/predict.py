@@ -467,7 +467,7 @@ def _patterns(writer: type[Writer], source: Stills | FrameReader) -> tuple[str, 
 
 def _numbered(file: str) -> str:
     """Return the name of a frame's file with ``*`` for its number, any other as it is."""
-    return re.sub(r"-\d+(\.\w+)$", r"-*\1", file)
+    return re.sub(r"-\d{7,}(\.\w+)$", r"-*\1", file)  # a frame has seven digits at least
 
 
 def _allot_stems(names: Sequence[str]) -> dict[str, str]:

@@ -38,6 +38,7 @@ from trilitenet.data.reading import (
     read_index,
 )
 from trilitenet.errors import DataError, import_extra
+from trilitenet.processing.images import orientation
 
 __all__ = ["KINDS", "CheckReport", "Finding", "check_dataset", "detect_layout"]
 
@@ -368,7 +369,7 @@ def _look_at_image(
     try:
         with Image.open(io.BytesIO(data)) as image:
             width, height = image.size
-            if image.getexif().get(0x0112, 1) in {5, 6, 7, 8}:
+            if orientation(image) in {5, 6, 7, 8}:
                 width, height = height, width
             # JPEGs are decoded at 1/2, 1/4 or 1/8: a whole file is read, in a part of the time.
             image.draft("L", (64, 64))

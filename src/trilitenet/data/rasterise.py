@@ -20,15 +20,18 @@ __all__ = ["check_finite", "draw_line", "fill_polygon", "flatten"]
 _STEP = 2.0
 """A curve is sampled about every so many pixels."""
 
+_FARTHEST = 30_000.0
+"""No image is so many pixels wide or high; a line that long would take hours, or all memory."""
+
 
 def check_finite(points: NDArray[np.float64]) -> None:
     """Refuse coordinates that no pixel has.
 
     Raises:
-        DataError: If one is infinite or not a number.
+        DataError: If one is infinite, not a number, or far out of any image.
     """
-    if not np.isfinite(points).all():
-        raise DataError("a polygon or line with a coordinate that is not a number")
+    if not (np.abs(points) <= _FARTHEST).all():
+        raise DataError(f"a polygon or line with a coordinate that is not a number, or beyond {_FARTHEST:.0f} pixels")
 
 
 def flatten(vertices: Sequence[Sequence[float]], types: str, *, closed: bool) -> NDArray[np.float64]:
@@ -47,7 +50,7 @@ def flatten(vertices: Sequence[Sequence[float]], types: str, *, closed: bool) ->
         (M, 2) float64 points; a closed shape's first point is not repeated.
 
     Raises:
-        DataError: If vertices and types do not fit each other, or a coordinate is not finite.
+        DataError: If vertices and types do not fit each other, or a coordinate is not finite or far out.
     """
     points = np.asarray(vertices, np.float64)
     types = types or "L" * len(points)
@@ -81,7 +84,7 @@ def fill_polygon(mask: NDArray[np.uint8], points: NDArray[np.float64], value: in
         value: What to set.
 
     Raises:
-        DataError: If a coordinate is not finite.
+        DataError: If a coordinate is not finite or far out.
     """
     check_finite(points)
     if len(points) < 3:
@@ -120,7 +123,7 @@ def draw_line(mask: NDArray[np.uint8], points: NDArray[np.float64], width: float
         value: What to set.
 
     Raises:
-        DataError: If a coordinate is not finite.
+        DataError: If a coordinate is not finite or far out.
     """
     check_finite(points)
     radius = width / 2

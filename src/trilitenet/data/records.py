@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trilitenet.errors import DataError, ShapeError
+from trilitenet.processing.images import orientation
 from trilitenet.processing.serialise import decode_mask
 
 __all__ = [
@@ -210,7 +211,7 @@ def image_size(path: Path) -> tuple[int, int]:
     try:
         with Image.open(path) as image:
             width, height = image.size
-            if image.getexif().get(0x0112, 1) in {5, 6, 7, 8}:
+            if orientation(image) in {5, 6, 7, 8}:
                 width, height = height, width
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise DataError(f"{path}: not an image that can be read ({error})") from error

@@ -14,7 +14,7 @@ from PIL import ExifTags, Image
 
 from trilitenet.errors import InputError, ShapeError
 
-__all__ = ["IMAGE_SUFFIXES", "read_image", "to_rgb"]
+__all__ = ["IMAGE_SUFFIXES", "orientation", "read_image", "to_rgb"]
 
 IMAGE_SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm"})
 """File name endings, in lower case, that are taken for images in folders."""
@@ -110,7 +110,7 @@ def to_rgb(array: NDArray[Any]) -> NDArray[np.uint8]:
 def _decode(image: Image.Image, name: str) -> NDArray[np.uint8]:
     try:
         image.load()
-        if (turn := _TURNS.get(_orientation(image))) is not None:
+        if (turn := _TURNS.get(orientation(image))) is not None:
             image = image.transpose(turn)
         if image.mode in {"I", "F"} or image.mode.startswith("I;16"):
             return _scale_deep(np.asarray(image), name, deep=image.mode.startswith("I;16"))
@@ -121,10 +121,12 @@ def _decode(image: Image.Image, name: str) -> NDArray[np.uint8]:
         raise InputError(f"{name}: is broken or truncated ({_reason(error)})") from error
 
 
-def _orientation(image: Image.Image) -> Any:
+def orientation(image: Image.Image) -> Any:
     """Return the orientation that EXIF notes; 1, upright, if EXIF cannot be read: the pixels may be whole."""
     try:
-        return image.getexif().get(ExifTags.Base.Orientation, 1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of damaged tags
+            return image.getexif().get(ExifTags.Base.Orientation, 1)
     except (*_BROKEN, TypeError):
         return 1
 

@@ -145,11 +145,23 @@ def test_errors_name_the_file(tmp_path: Path) -> None:
         parse_labels({"labels": [{"category": "car", "box2d": {"x1": 1}}]}, Path("x.jpg"), "x.json")
 
 
-def test_a_broken_document_is_counted_and_the_rest_converted(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "content",
+    [
+        '{"name": "a2"',
+        '{"name": "a2", "attributes": 1}',
+        '{"frames": 1}',
+        '{"frames": [null]}',
+        '{"frames": [{"objects": [7]}]}',
+        '{"labels": 1}',
+        "[]",
+    ],
+)
+def test_a_broken_document_is_counted_and_the_rest_converted(tmp_path: Path, content: str) -> None:
     raw = tmp_path / "raw"
     raw_bdd.write_images(raw)
     raw_bdd.write_2018_documents(raw)
-    (raw / "labels/100k/train/a2.json").write_text(json.dumps({"name": "a2"})[:-3])
+    (raw / "labels/100k/train/a2.json").write_text(content)
     report = convert(read_bdd100k(raw), tmp_path / "out")
     assert report.images == {"train": 1, "val": 1}
     assert report.dropped["train"]["image: labels or image broken"] == 1

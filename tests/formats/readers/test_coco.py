@@ -97,6 +97,9 @@ def test_errors(tmp_path: Path) -> None:
     path.write_text("{")
     with pytest.raises(DataError, match="not JSON"):
         read_coco(path)
+    path.write_text('{"images": [], "annotations": [1.5]}')
+    with pytest.raises(DataError, match="no COCO annotations"):
+        read_coco(tmp_path)
     path.write_text(json.dumps(coco()))
     with pytest.raises(DataError, match="none of the images"):
         read_coco(path)

@@ -83,9 +83,10 @@ def test_errors(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"no \.xml file"):
         read_cvat(tmp_path)
     path = tmp_path / "annotations.xml"
-    path.write_text("<annotations>")
-    with pytest.raises(DataError, match="not XML"):
-        read_cvat(tmp_path)
+    for text in ("<annotations>", '<?xml version="1.0" encoding="utf-9"?><annotations/>'):
+        path.write_text(text)
+        with pytest.raises(DataError, match="not XML"):
+            read_cvat(tmp_path)
     path.write_text('<annotations><track id="0" label="car"></track></annotations>')
     with pytest.raises(DataError, match="CVAT for video"):
         read_cvat(tmp_path)

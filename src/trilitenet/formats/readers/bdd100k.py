@@ -201,23 +201,18 @@ def parse_labels(content: Any, image: Path, source: str, tasks: Collection[Task]
     """
     if not isinstance(content, dict):
         raise DataError(f"{source}: an image's entry must be an object, got {type(content).__name__}")
-    frames = content.get("frames")
-    if frames is not None:
-        items = [item for frame in frames for item in (frame.get("objects") or ())]
-    elif "labels" in content or "name" in content:
-        items = content.get("labels") or []
-    else:
+    if content.get("frames") is None and not {"labels", "name"} & content.keys():
         raise DataError(f"{source}: neither 'frames' (2018, one file an image) nor 'labels' (Scalabel) in the entry")
     objects: list[ObjectLabel] = []
     areas: list[AreaLabel] = []
     lanes: list[LaneLabel] = []
     dropped: Counter[str] = Counter()
     try:
-        for item in items:
+        for item in _items(content):
             _parse_item(item, objects, areas, lanes, dropped)
+        attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise DataError(f"{source}: {image.stem}: {brief(error)} is not as BDD100K has it") from error
-    attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
     return ImageRecord(
         name=image.stem,
         image=image,
@@ -227,6 +222,14 @@ def parse_labels(content: Any, image: Path, source: str, tasks: Collection[Task]
         attributes=attributes,
         dropped=dict(dropped),
     )
+
+
+def _items(content: Mapping[str, Any]) -> list[Any]:
+    """Return the labels of an image's entry, of either generation."""
+    frames = content.get("frames")
+    if frames is not None:
+        return [item for frame in frames for item in (frame.get("objects") or ())]
+    return [*(content.get("labels") or ())]
 
 
 def _parse_item(
@@ -335,10 +338,12 @@ def _tasks_of(path: Path) -> frozenset[Task]:
 
 
 def _tasks_in(entry: Any) -> set[Task]:
-    """Return the tasks that an image's entry has labels of."""
+    """Return the tasks that an image's entry has labels of; a broken one, told when it is read, has none."""
     tasks: set[Task] = set()
-    frames = entry.get("frames")
-    items = entry.get("labels") or [item for frame in frames or () for item in frame.get("objects") or ()]
+    try:
+        items = [item for item in _items(entry) if isinstance(item, dict)]
+    except (TypeError, AttributeError):
+        return tasks
     for item in items:
         category = str(item.get("category"))
         if item.get("box2d") is not None:

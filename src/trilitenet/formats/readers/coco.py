@@ -74,7 +74,9 @@ def _is_coco(path: Path) -> bool:
     if not isinstance(content, dict) or not {"images", "annotations"} <= set(content):
         return False
     items = content["annotations"]
-    return not items or (isinstance(items, list) and any("category_id" in item for item in items))
+    if not isinstance(items, list):
+        return not items
+    return not items or any(isinstance(item, dict) and "category_id" in item for item in items)
 
 
 def _split_of(path: Path, default: str) -> str:

@@ -75,7 +75,9 @@ def _read_file(path: Path, folder: Path, mapping: LabelMapping, records: dict[st
             elif element.tag == "image":
                 images.append(element)
                 categories |= {shape.get("label", "") for shape in element}
-    except ElementTree.ParseError as error:
+    except DataError:
+        raise
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two of its encoding
         raise DataError(f"{path}: not XML ({error})") from error
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
