@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import asyncio
 import http.client
 import json
 import logging
@@ -14,8 +15,9 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import numpy as np
 import pytest
 from uvicorn.protocols.http.flow_control import FlowControl
 
@@ -282,6 +284,59 @@ def test_a_client_that_does_not_read_is_cut_off(make_app: MakeApp, run_app: Run)
     connection.close()
 
 
+def test_a_client_that_reads_slowly_without_end_is_cut_off(make_app: MakeApp, run_app: Run) -> None:
+    running = run_app(make_app(send_timeout=5.0, answer_timeout=1.0))
+    noise = np.random.default_rng(0).integers(0, 256, (1500, 2000, 3), np.uint8)
+    body = encode(noise, "JPEG")
+    with socket.socket() as connection:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        connection.settimeout(60)
+        connection.connect(("127.0.0.1", running.port))
+        head = b"POST /v1/predict?format=overlay HTTP/1.1\r\nhost: x\r\naccept: image/png\r\ncontent-length: %d\r\n\r\n"
+        connection.sendall(head % len(body) + body)
+        taken = len(connection.recv(4096))
+        while running.server.server_state.connections:
+            taken += len(connection.recv(4096))  # all of it would take 10 s
+            time.sleep(0.005)
+    assert taken < 4_000_000
+    _wait(lambda: not running.app.service.memory.used)
+
+
+@pytest.mark.parametrize("headers", [b"", b"connection: close\r\n"])
+def test_the_rest_of_an_answer_is_not_kept_for_ever(make_app: MakeApp, run_app: Run, headers: bytes) -> None:
+    running = run_app(make_app(send_timeout=0.3, keep_alive=1.0))
+    with _connect(running) as connection:
+        connection.sendall(b"GET /healthz HTTP/1.1\r\nhost: x\r\n" + headers)
+        (protocol,) = _wait(lambda: list(running.server.server_state.connections))
+        assert isinstance(protocol, GuardedProtocol)
+        transport = protocol.transport
+        # Nothing can be sent, as if the client read nothing.
+        protocol.transport = _Deaf(transport)  # type: ignore[assignment]
+        connection.sendall(b"\r\n")
+        _wait(lambda: transport.is_closing())
+        _wait(lambda: not running.server.server_state.connections)
+
+
+class _Deaf:
+    """A transport that keeps what is written, and waits with closing until somebody has read it."""
+
+    def __init__(self, transport: asyncio.Transport) -> None:
+        self._transport = transport
+        self._closing = False
+
+    def write(self, data: bytes) -> None:
+        pass
+
+    def close(self) -> None:
+        self._closing = True
+
+    def is_closing(self) -> bool:
+        return self._closing
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._transport, name)
+
+
 class _Transport:
     """A transport whose client reads as a test says."""
 
@@ -300,24 +355,47 @@ class _Loop:
     """Calls later when a test says so."""
 
     def __init__(self) -> None:
+        self.now = 0.0
         self.later: Callable[[], None] = lambda: None
 
+    def time(self) -> float:
+        return self.now
+
     def call_later(self, seconds: float, function: Callable[..., None], *arguments: object) -> None:
-        self.later = lambda: function(*arguments)
+        def later() -> None:
+            self.now += seconds
+            function(*arguments)
+
+        self.later = later
 
 
-def test_a_client_that_reads_slowly_is_not_cut_off() -> None:
+@pytest.fixture
+def paused() -> tuple[_Transport, _Loop]:
+    """The transport and the loop of a connection whose client does not read."""
     protocol = GuardedProtocol.__new__(GuardedProtocol)
     transport, loop = _Transport(), _Loop()
     protocol.transport, protocol.loop = transport, loop  # type: ignore[assignment]
     protocol.flow = FlowControl(transport)  # type: ignore[arg-type]
     protocol.pause_writing()
-    for left in (900, 500, 499):
+    return transport, loop
+
+
+def test_a_client_that_reads_slowly_is_not_cut_off(paused: tuple[_Transport, _Loop]) -> None:
+    transport, loop = paused
+    for left in (900, 499):
         transport.unread = left
         loop.later()
         assert not transport.aborted
     loop.later()
     assert transport.aborted
+
+
+def test_a_client_that_takes_a_few_bytes_now_and_then_is_cut_off(paused: tuple[_Transport, _Loop]) -> None:
+    transport, loop = paused
+    while not transport.aborted:
+        transport.unread -= 1
+        loop.later()
+    assert loop.now == GuardedProtocol.limits.answer_timeout
 
 
 def test_a_full_queue_is_told_with_retry_after(

@@ -146,7 +146,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._cancel()
         self._in_headers = False
         # The application answers 408 in time; this only ends connections that trickle on after their answer.
-        self._due = self.loop.call_later(self.limits.upload_timeout + 5.0, self.transport.close)
+        self._due = self.loop.call_later(self.limits.upload_timeout + 5.0, self._close)
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
@@ -169,14 +169,24 @@ class GuardedProtocol(HttpToolsProtocol):
             return
         if self.cycle is None and not self.transport.is_closing():
             self._cancel()
-            self._due = self.loop.call_later(_LAST_CALL, self.transport.close)
+            self._due = self.loop.call_later(_LAST_CALL, self._close)
         else:
             super().shutdown()
 
+    def on_response_complete(self) -> None:
+        """The answer is written: if the connection ends with it, its rest must be taken in time."""
+        super().on_response_complete()
+        if self.transport.is_closing():
+            self._close()
+
+    def timeout_keep_alive_handler(self) -> None:
+        """End an idle connection."""
+        self._close()
+
     def pause_writing(self) -> None:
-        """The client does not read: it has so long to take something."""
+        """The client does not read: it has so long to take something, and so long to take nearly all."""
         super().pause_writing()
-        self._wait_for_reading()
+        self._wait_for_reading(self.loop.time() + self.limits.answer_timeout)
 
     def resume_writing(self) -> None:
         """The client reads again."""
@@ -184,15 +194,22 @@ class GuardedProtocol(HttpToolsProtocol):
             self._stuck.cancel()
         super().resume_writing()
 
-    def _wait_for_reading(self) -> None:
+    def _wait_for_reading(self, until: float) -> None:
         left = self.transport.get_write_buffer_size()
-        self._stuck = self.loop.call_later(self.limits.send_timeout, self._check_reading, left)
+        seconds = min(self.limits.send_timeout, until - self.loop.time())
+        self._stuck = self.loop.call_later(seconds, self._check_reading, left, until)
 
-    def _check_reading(self, left: int) -> None:
-        if self.transport.get_write_buffer_size() < left:
-            self._wait_for_reading()
+    def _check_reading(self, left: int, until: float) -> None:
+        if self.transport.get_write_buffer_size() < left and self.loop.time() < until:
+            self._wait_for_reading(until)
         else:
             self.transport.abort()
+
+    def _close(self) -> None:
+        """Close the connection, and do not wait for ever until its client has taken the rest of an answer."""
+        self._cancel()
+        self.transport.close()
+        self._due = self.loop.call_later(self.limits.send_timeout, self.transport.abort)
 
     def _wait_for_headers(self) -> None:
         self._cancel()
@@ -203,7 +220,7 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def _headers_lost(self) -> None:
         if self.cycle is not None and not self._header_bytes:
-            self.transport.close()  # between two requests
+            self._close()  # between two requests
         else:
             self._refuse(408, "headers_timeout", "the headers did not arrive in time")
 
@@ -226,7 +243,7 @@ class GuardedProtocol(HttpToolsProtocol):
         logger.info("connection refused", extra={"status": status, "problem": code})
         if self.cycle is not None and not self.cycle.response_complete:
             if self._in_headers or self.pipeline or self.cycle.response_started:
-                self.transport.close()  # an answer to an earlier request is on its way
+                self._close()  # an answer to an earlier request is on its way
                 return
             self.cycle.disconnected = True  # its body is broken: the application need not wait for it
             self.cycle.message_event.set()
@@ -236,7 +253,7 @@ class GuardedProtocol(HttpToolsProtocol):
             f"content-length: {len(body)}\r\nconnection: close\r\n\r\n{body}".encode()
         )
         self.transport.write_eof()
-        self._due = self.loop.call_later(_LAST_CALL, self.transport.close)
+        self._due = self.loop.call_later(_LAST_CALL, self._close)
 
 
 class GuardedServer(uvicorn.Server):

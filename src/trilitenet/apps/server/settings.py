@@ -34,6 +34,7 @@ class Settings:
         header_timeout: From the first byte of a request (or from connecting) to the end of its headers.
         upload_timeout: From the end of the headers to the end of the body.
         send_timeout: A client that takes nothing of its answer for so long is cut off.
+        answer_timeout: From the answer to when the client has taken nearly all of it; then it is cut off.
         keep_alive: An idle connection is closed after this.
         drain: After SIGTERM the service still accepts for so long, so that load balancers see it is not ready.
         shutdown_timeout: How long accepted requests may take to finish after that.
@@ -55,6 +56,7 @@ class Settings:
     header_timeout: float = 5.0
     upload_timeout: float = 20.0
     send_timeout: float = 20.0
+    answer_timeout: float = 60.0
     keep_alive: float = 15.0
     drain: float = 1.0
     shutdown_timeout: float = 30.0
