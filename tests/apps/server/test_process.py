@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import http.client
 import json
 import logging
@@ -101,6 +102,30 @@ def test_long_headers_are_refused_also_when_they_are_there_at_once(app: Applicat
     assert json.loads(answer.split(b"\r\n\r\n")[1])["error"]["code"] == "headers_too_long"
     with _connect(running) as connection:
         connection.sendall(b"GET /healthz HTTP/1.1\r\nhost: x\r\nx: " + b"y" * 32_000 + b"\r\n\r\n")
+        assert connection.recv(1000).startswith(b"HTTP/1.1 200")
+
+
+@pytest.mark.parametrize(
+    "pieces", [[b"0\r\n", b"x: y\r\n" * 2000], [b"0\r\nx: ", b"y" * 10_000], [b"1;", b"x" * 10_000]]
+)
+def test_what_nobody_asked_for_in_a_body_has_a_largest_size(
+    app: Application, run_app: Run, pieces: list[bytes]
+) -> None:
+    running = run_app(app)
+    with _connect(running) as connection:
+        connection.sendall(b"POST /v1/predict HTTP/1.1\r\nhost: x\r\ntransfer-encoding: chunked\r\n\r\n" + pieces[0])
+        with contextlib.suppress(ConnectionError):
+            for _ in range(100):
+                connection.sendall(pieces[1])
+                time.sleep(0.001)
+        assert connection.recv(1000).startswith(b"HTTP/1.1 431")
+
+
+def test_headers_after_a_body_are_passed_over(app: Application, run_app: Run, jpeg: bytes) -> None:
+    head = b"POST /v1/predict HTTP/1.1\r\nhost: x\r\ntransfer-encoding: chunked\r\n\r\n"
+    chunks = b"".join(b"1\r\n%c\r\n" % byte for byte in jpeg + bytes(20_000))
+    with _connect(run_app(app)) as connection:
+        connection.sendall(head + chunks + b"0\r\ncontent-type: multipart/form-data\r\n\r\n")
         assert connection.recv(1000).startswith(b"HTTP/1.1 200")
 
 

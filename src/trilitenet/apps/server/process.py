@@ -69,6 +69,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._in_headers = True
         self._header_bytes = 0
         self._parsed_bytes = 0
+        self._bytes_between = 0
         self._refused = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -95,7 +96,7 @@ class GuardedProtocol(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes; those of headers are counted."""
+        """Take bytes; those of headers, and those between pieces of a body, are counted."""
         if self.transport.is_closing() or self._refused:
             return
         if self._in_headers:
@@ -104,10 +105,11 @@ class GuardedProtocol(HttpToolsProtocol):
             head = data if end < 0 else data[:end]
             if _UPGRADE.search(head):
                 data = _UPGRADE.sub(b"\r\nignored", head) + data[len(head) :]
+        self._bytes_between += len(data)
         super().data_received(data)
         if self._in_headers and self._due is None and (self.cycle is None or self.cycle.response_complete):
             self._wait_for_headers()  # line breaks before a request begin no message, but end the idle time
-        if self._in_headers and self._header_bytes > _MAX_HEADERS:
+        if (self._header_bytes if self._in_headers else self._bytes_between) > _MAX_HEADERS:
             self._refuse_headers()
 
     def send_400_response(self, msg: str) -> None:
@@ -128,7 +130,9 @@ class GuardedProtocol(HttpToolsProtocol):
         super().on_url(url)
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Take a header."""
+        """Take a header; what comes after the body is none."""
+        if not self._in_headers:
+            return
         self._parsed_bytes += len(name) + len(value)
         super().on_header(name, value)
 
@@ -145,12 +149,14 @@ class GuardedProtocol(HttpToolsProtocol):
             return
         self._cancel()
         self._in_headers = False
+        self._bytes_between = 0
         # The application answers 408 in time; this only ends connections that trickle on after their answer.
         self._due = self.loop.call_later(self.limits.upload_timeout + 5.0, self._close)
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
-        """Take a piece of the body."""
+        """Take a piece of the body; between two, little may come: sizes of chunks, and what nobody asked for."""
+        self._bytes_between = 0
         if not self._refused:
             super().on_body(body)
 
