@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import http.client
 import logging
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from tests.apps.server.conftest import TOKEN, FakeBackend, MakeApp, encode
+from tests.apps.server.conftest import TOKEN, FakeBackend, MakeApp, Running, encode
 from trilitenet.apps.server.application import Application
 
 
@@ -23,6 +24,30 @@ def test_every_answer_has_the_security_headers(client: TestClient, path: str) ->
     assert "frame-ancestors 'none'" in headers["content-security-policy"]
     assert "access-control-allow-origin" not in headers
     assert "server" not in headers
+
+
+@pytest.mark.parametrize("path", ["/", "/healthz", "/metrics", "/v1/models", "/v2", "/openapi.json", "/nowhere"])
+def test_head_is_answered_as_get_without_the_body(
+    app: Application, run_app: Callable[[Application], Running], path: str
+) -> None:
+    client = http.client.HTTPConnection("127.0.0.1", run_app(app).port, timeout=20)
+    answers = []
+    for method in ("HEAD", "GET", "HEAD"):  # on one connection: a body would be taken for the next answer
+        client.request(method, path)
+        answer = client.getresponse()
+        answer.read()
+        answers.append((answer.status, answer.headers["content-type"]))
+    client.close()
+    assert answers[0] == answers[1] == answers[2]
+    text = app.service.metrics.text().decode()
+    assert 'trilitenet_requests_total{method="HEAD",route="' in text
+
+
+def test_what_a_browser_has_is_not_sent_again(client: TestClient) -> None:
+    etag = client.get("/app.js").headers["etag"]
+    for given in (etag, f"W/{etag}", f'"x", {etag}'):
+        assert client.get("/app.js", headers={"if-none-match": given}).status_code == 304
+    assert client.get("/app.js", headers={"if-none-match": '"x"'}).status_code == 200
 
 
 def test_there_is_no_cors(client: TestClient, jpeg: bytes) -> None:

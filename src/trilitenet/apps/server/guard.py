@@ -67,7 +67,10 @@ class Guard:
             await self._request(scope, receive, send)
 
     async def _request(self, scope: Scope, receive: Receive, send: Send) -> None:
-        exchange = _Exchange(scope, receive, send, self._service)
+        method = scope["method"]
+        if method == "HEAD":  # answered as GET; the server leaves the body out
+            scope = {**scope, "method": "GET"}
+        exchange = _Exchange(scope, method, receive, send, self._service)
         scope.setdefault("state", {}).update(request_id=exchange.identifier, reservation=exchange.reservation)
         try:
             try:
@@ -96,7 +99,7 @@ class Guard:
                 raise ProblemError(
                     401, "unauthorized", "this service needs a bearer token", {"www-authenticate": "Bearer"}
                 )
-        if scope["method"] not in {"GET", "HEAD"} and headers.get("sec-fetch-site") == "cross-site":
+        if scope["method"] != "GET" and headers.get("sec-fetch-site") == "cross-site":
             raise ProblemError(403, "cross_site", "another web site may not use this service through its visitors")
         if headers.get("content-encoding", "identity").lower() not in {"", "identity"}:
             raise ProblemError(415, "content_encoding", "compressed bodies are not taken: send the image as it is")
@@ -119,13 +122,14 @@ def _label(path: str) -> str:
 class _Exchange:
     """One request and its answer: limits on the way in, headers and counts on the way out."""
 
-    def __init__(self, scope: Scope, receive: Receive, send: Send, service: Service) -> None:
+    def __init__(self, scope: Scope, method: str, receive: Receive, send: Send, service: Service) -> None:
         self.headers = Headers(scope=scope)
         given = self.headers.get("x-request-id", "")
         self.identifier = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
         self.started = False
         self.reservation = Reservation(service.memory)
         self._scope = scope
+        self._method = method
         self._receive = receive
         self._send = send
         self._service = service
@@ -196,7 +200,7 @@ class _Exchange:
         # Without a route it was refused before routing, or there is none.
         route = getattr(self._scope.get("route"), "path", None) or _label(self._scope["path"])
         problem = self._scope["state"].get("problem")
-        self._service.metrics.answer(route, self._scope["method"], self._status, seconds)
+        self._service.metrics.answer(route, self._method, self._status, seconds)
         if self._status == 499:
             self._service.metrics.vanish()
         elif problem is not None:
@@ -205,7 +209,7 @@ class _Exchange:
             "request",
             extra={
                 "request_id": self.identifier,
-                "method": self._scope["method"],
+                "method": self._method,
                 "route": route,
                 "status": self._status,
                 "milliseconds": round(seconds * 1e3, 1),

@@ -16,10 +16,7 @@ _SCRIPTS: Final = ("app.js", "client.js", "draw.js", "sources.js")
 _FILES: Final = {
     "/": ("index.html", "text/html; charset=utf-8"),
     "/app.css": ("app.css", "text/css; charset=utf-8"),
-    **{
-        f"/{name}": (name, "text/javascript; charset=utf-8")
-        for name in ("app.js", "client.js", "draw.js", "sources.js")
-    },
+    **{f"/{name}": (name, "text/javascript; charset=utf-8") for name in _SCRIPTS},
     "/icon.svg": ("icon.svg", "image/svg+xml"),
 }
 PAGE_PATHS: Final = frozenset(_FILES)
@@ -40,7 +37,7 @@ def pages_router() -> APIRouter:
     """Return the routes of the page's files."""
     router = APIRouter(include_in_schema=False)
     for path, (name, media_type) in _FILES.items():
-        router.add_api_route(path, _serve(_read(name, media_type)), methods=["GET", "HEAD"])
+        router.add_api_route(path, _serve(_read(name, media_type)), methods=["GET"])
     return router
 
 
@@ -58,7 +55,7 @@ def _read(name: str, media_type: str) -> _File:
 
 def _serve(file: _File) -> Callable[[Request], Awaitable[Response]]:
     async def page(request: Request) -> Response:
-        if request.headers.get("if-none-match") == file.headers["etag"]:
+        if file.headers["etag"] in request.headers.get("if-none-match", ""):  # one of a list, or marked W/ by a proxy
             return Response(status_code=304, headers=file.headers)
         return Response(file.content, headers=file.headers)
 
