@@ -210,6 +210,18 @@ def test_toggles_and_opacity_draw_again(page: Page, photo: Path) -> None:
     np.testing.assert_allclose(page.pixel(*edge), page.pixel(0.05, edge[1]), atol=2)
 
 
+def test_layers_can_be_hidden_where_the_picture_is_transparent(page: Page, tmp_path: Path) -> None:
+    path = tmp_path / "clear.png"
+    Image.new("RGBA", (640, 360)).save(path)
+    page.see(path)
+    opaque = "return document.getElementById('view').getContext('2d').getImageData(9, 350, 1, 1).data[3] / 255"
+    for _ in range(4):
+        page["show-drivable"].click()
+    assert page.script(opaque) == pytest.approx(0.45, abs=0.01)
+    page["show-drivable"].click()
+    assert page.script(opaque) == 0
+
+
 def test_labels_do_not_hide_each_other(page: Page) -> None:
     boxes = [
         {"xyxy": [100, 100, 300, 200], "confidence": 0.9, "class_id": 0, "class_name": "vehicle"},
@@ -511,5 +523,12 @@ def test_a_token_is_asked_for_and_used(browser: Page, photo: Path) -> None:
         assert not browser["token-form"].is_displayed()
         assert not browser["error"].is_displayed()
         assert browser.see(photo).startswith("2 vehicles")
+        # A photo chosen before there is a token is seen with it, and the model is told of too.
+        browser.open(running.url)
+        browser.choose(photo)
+        browser.wait(lambda: browser["token-form"].is_displayed())
+        browser["token"].send_keys(TOKEN, Keys.ENTER)
+        browser.wait(lambda: browser["summary"].text.startswith("2 vehicles"))
+        assert "model tiny" in browser["model"].text
     finally:
         assert running.stop()

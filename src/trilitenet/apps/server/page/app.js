@@ -21,6 +21,7 @@ let rate = 5;
 let fileName = "picture";
 let playing = false;
 let work = null; // AbortController of what runs now
+let met = null; // promise of what the service says of its model
 let retry = null; // what to do again once there is a token
 let tokenSent = false; // whether a token was given that has opened nothing yet
 
@@ -118,6 +119,23 @@ function tellCurrent() {
   else element("summary").textContent = "";
 }
 
+/** Learn which model is served: before the first job, or with the first one that has the token. */
+async function meet() {
+  try {
+    const model = await getModel();
+    if (model.card.tasks.length < 3) element("tasks").textContent = model.card.tasks.join(", ");
+    element("model").textContent = `model ${model.name} on ${model.backend}`;
+    floor = Math.max(floor, model.least_confidence);
+    chunkSize = Math.min(chunkSize, model.max_images);
+    element("confidence").min = floor;
+    element("confidence").value = model.card.thresholds.confidence;
+    readControls();
+  } catch (error) {
+    met = null;
+    throw error;
+  }
+}
+
 /** Run a job; another one stops it. Errors are shown, and a missing token is asked for. */
 async function run(job) {
   work?.abort();
@@ -128,6 +146,8 @@ async function run(job) {
   showError("");
   element("stop").hidden = false;
   try {
+    await (met ??= meet());
+    mine.signal.throwIfAborted();
     await job(mine.signal);
     tokenSent = false;
   } catch (error) {
@@ -311,13 +331,4 @@ document.addEventListener("drop", (event) => {
 });
 document.addEventListener("paste", (event) => openFile(event.clipboardData.files[0]));
 
-run(async () => {
-  const model = await getModel();
-  if (model.card.tasks.length < 3) element("tasks").textContent = model.card.tasks.join(", ");
-  element("model").textContent = `model ${model.name} on ${model.backend}`;
-  floor = Math.max(floor, model.least_confidence);
-  chunkSize = Math.min(chunkSize, model.max_images);
-  element("confidence").min = floor;
-  element("confidence").value = model.card.thresholds.confidence;
-  readControls();
-});
+run(async () => {}); // only meet the service

@@ -73,6 +73,7 @@ export function drawFrame(view, frame, options) {
   if (view.height !== picture.height) view.height = picture.height;
   const context = view.getContext("2d");
   context.globalAlpha = 1;
+  context.clearRect(0, 0, view.width, view.height); // a picture with transparent parts does not hide what was drawn before
   context.drawImage(picture, 0, 0);
   for (const name of ["drivable", "lane"]) {
     if (frame[name] && options[name].show) {
