@@ -116,6 +116,8 @@ def _listen(host: str, port: int) -> socket.socket:
 
     The server listens on it when it is ready; until then connections are refused, not kept waiting.
     """
+    if not host:  # the system would take it for every address
+        raise ConfigError("host must be an address or a name; 0.0.0.0 lets other machines in")
     if not 0 <= port <= 65535:
         raise ConfigError(f"cannot listen on {host} port {port} (port must be 0 to 65535); choose with --port")
     listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
