@@ -21,7 +21,7 @@ import yaml
 import trilitenet
 from trilitenet.commands.train import train
 from trilitenet.commands.train_table import train_table
-from trilitenet.config import TASKS
+from trilitenet.config import DEFAULT_ANCHORS, TASKS
 from trilitenet.data.description import read_description, write_description
 from trilitenet.data.prepared import prepare
 from trilitenet.data.reading import DrivingDataset
@@ -33,6 +33,7 @@ from trilitenet.engine.predictions import PredictionWriter
 from trilitenet.engine.recipe import read_recipe
 from trilitenet.engine.train import Trainer
 from trilitenet.errors import ConfigError, DataError, OutputError, TrainingError, WeightsError
+from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.models.encoder import Encoder
 from trilitenet.models.trilitenet import TriLiteNet
 from trilitenet.models.weights import load_network, read_card
@@ -430,6 +431,24 @@ def test_a_prepared_data_set_is_trained_on_without_validation(scenes: Path, tmp_
     with pytest.raises(DataError, match="prepared with --mask-above 64, 1 is wanted"):
         train(**options)
     assert train(augmentation__mask_above=64, **options).steps == 1
+
+
+def test_resuming_takes_the_anchors_for_distillation_too(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a GPU the losses have copies of the anchors; on a CPU they share them, which would hide the mistake."""
+    made = []
+
+    def build(student: torch.Tensor, *more: Any) -> DistillationLoss:
+        made.append(DistillationLoss(student.clone(), *more))
+        return made[-1]
+
+    monkeypatch.setattr("trilitenet.commands.train.DistillationLoss", build)
+    own = (np.array(DEFAULT_ANCHORS) * 1.5).tolist()
+    train(**settings(scenes, tmp_path, max_steps=1, teacher="tiny", anchors=own))
+    train(**settings(scenes, tmp_path, max_steps=2, teacher="tiny"), resume=True)
+    for loss in made:
+        torch.testing.assert_close(loss.get_buffer("student_anchors"), torch.tensor(own))
 
 
 @pytest.mark.parametrize("part", ["network", "optimiser", "random"])

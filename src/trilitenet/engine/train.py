@@ -435,6 +435,8 @@ class Trainer:
         self.network.load_state_dict(state["network"])
         if self.loss.detection is not None:
             self.loss.detection.anchors.copy_(self.network.anchors)
+        if self.teacher:
+            self.teacher[1].get_buffer("student_anchors").copy_(self.network.anchors)
         if self.ema is not None:
             # A run without an average that goes on with one: it begins at the weights as they are.
             self.ema.load_state_dict(state["ema"] or {"updates": 0, "network": state["network"]})
