@@ -518,8 +518,10 @@ def test_two_processes_follow_one(scenes: Path, tmp_path: Path) -> None:
         recipe.write_text(
             yaml.safe_dump({key: list(value) if isinstance(value, tuple) else value for key, value in config.items()})
         )
+        # The code is no script that could be run again by a second process.
         done = subprocess.run(
-            [sys.executable, "-m", "trilitenet", "train", str(recipe)],
+            [sys.executable, "-"],
+            input=f"import trilitenet; print(trilitenet.train({str(recipe)!r}).summary())",
             check=False,
             capture_output=True,
             text=True,
@@ -527,10 +529,17 @@ def test_two_processes_follow_one(scenes: Path, tmp_path: Path) -> None:
             env={**os.environ, "OMP_NUM_THREADS": "1"},
         )
         assert done.returncode == 0, done.stderr
+        assert done.stdout.count("finished after 6 steps") == 1
         rows = read_csv(tmp_path / str(devices) / "metrics.csv")
         curves[devices] = [value for _, name, value in rows if name == "train/total"]
     assert len(curves[1]) == len(curves[2]) == 6
     assert curves[2] == pytest.approx(curves[1], rel=0.1)
+
+
+def test_the_first_process_alone_tells_the_result(tmp_path: Path) -> None:
+    result = engine.TrainResult(tmp_path, tmp_path / "w", 3, True, {}, {}, 1.0)
+    assert result.summary().startswith("finished after 3 steps")
+    assert dataclasses.replace(result, first=False).summary() == ""
 
 
 def test_engine_names_the_figures_validation_returns() -> None:

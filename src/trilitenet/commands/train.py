@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import json
+import logging
 import math
 import re
 import sys
@@ -32,10 +34,10 @@ from trilitenet.engine.lessons import Lessons, TaughtTransform
 from trilitenet.engine.loggers import build_loggers
 from trilitenet.engine.recipe import TrainConfig, merge, read_recipe
 from trilitenet.engine.results import write_results
-from trilitenet.engine.runtime import make_fabric
+from trilitenet.engine.runtime import follow, running_fabric
 from trilitenet.engine.train import CHECKPOINT_NAME, Trainer, TrainResult, holds_run
 from trilitenet.engine.transfer import freeze, initialise
-from trilitenet.errors import ConfigError, DataError, OutputError
+from trilitenet.errors import ConfigError, DataError, OutputError, TriLiteNetError
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.torch_backend import TorchBackend
 from trilitenet.losses.detection import DetectionLoss
@@ -71,7 +73,6 @@ def train(
     if not config.data:
         raise ConfigError("no data: give the root folder of a data set with --data")
     folder = Path(config.output)
-    checkpoint = folder / CHECKPOINT_NAME
     if holds_run(folder) and not (resume or overwrite):
         raise OutputError(
             f"{folder}: holds a run already, or files that a run would replace; --resume it, --overwrite it, or give "
@@ -82,7 +83,19 @@ def train(
             f"{config.data}: is prepared, and figures are measured on images as they are; give the data set that it "
             "was made of (a copy in its .prepared is used by itself), or --val-split '' to go without"
         )
-    fabric = make_fabric(config.device, config.precision, devices=config.devices, num_nodes=config.num_nodes)
+    with running_fabric(
+        config.device,
+        config.precision,
+        devices=config.devices,
+        num_nodes=config.num_nodes,
+        command=_command(config, resume=resume, overwrite=overwrite),
+    ) as fabric:
+        return _train(config, fabric, recipe, resume=resume)
+
+
+def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: bool) -> TrainResult:
+    """Train as one of the processes of a run."""
+    folder = Path(config.output)
     torch.manual_seed(config.seed)
     with _Display(quiet=not fabric.is_global_zero) as display:
         dataset = _training_data(config)
@@ -115,7 +128,7 @@ def train(
             display=display,
         )
         result = trainer.fit(
-            checkpoint if resume else None,
+            folder / CHECKPOINT_NAME if resume else None,
             lambda step: build_loggers(config.loggers, folder, config.to_dict(), step),
         )
         if fabric.is_global_zero and result.finished and "csv" in config.loggers:
@@ -129,6 +142,27 @@ def train(
                 pictures=[] if validation is None else _pictures(predictor, validation, config.pictures),
             )
     return result
+
+
+def _command(config: TrainConfig, *, resume: bool, overwrite: bool) -> list[str]:
+    """Return what starts a further process of a run, wherever the first one was called from."""
+    # Ctrl-C reaches it too, and is the first one's affair from the beginning.
+    code = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "
+    code += f"from {__name__} import _take_part; _take_part()"
+    settings = {**config.to_dict(), "resume": resume, "overwrite": overwrite}
+    return [sys.executable, "-c", code, json.dumps(settings)]
+
+
+def _take_part() -> None:
+    """Be a further process of a run; only what the first one does not say is said."""
+    follow()
+    logging.basicConfig(level="ERROR", format="%(levelname)s %(name)s: %(message)s")
+    logging.getLogger("trilitenet.engine.guard").setLevel("WARNING")  # names the images of this process
+    try:
+        train(**json.loads(sys.argv[1]))
+    except TriLiteNetError as error:
+        sys.stderr.write(f"error: {error}\n")
+        raise SystemExit(1) from error
 
 
 def _training_data(config: TrainConfig) -> SampleSource:

@@ -6,17 +6,22 @@ import contextlib
 import ctypes
 import datetime
 import logging
+import os
 import signal
+import subprocess
 import sys
 import threading
+import time
+from collections.abc import Iterator, Sequence
 from types import FrameType, TracebackType
 from typing import Any, Final
 
 import torch
 
-from trilitenet.errors import BackendError, ConfigError, import_extra
+from trilitenet.errors import BackendError, ConfigError, TrainingError, TriLiteNetError, import_extra
+from trilitenet.processing.cores import usable_cores
 
-__all__ = ["StopRequest", "keep_freed_memory", "make_fabric", "pick_precision"]
+__all__ = ["RESUME", "StopRequest", "follow", "keep_freed_memory", "pick_precision", "running_fabric"]
 
 log = logging.getLogger(__name__)
 
@@ -25,6 +30,14 @@ _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4
 
 _PATIENCE: Final = datetime.timedelta(days=1)
 """Processes wait so long for each other."""
+
+_GRACE: Final = 10.0
+"""Seconds in which the first process is to notice by itself that another has ended."""
+
+_ERROR_KEY: Final = "trilitenet/error"
+"""Where, in the store that the processes share, one says why it ends."""
+
+RESUME: Final = "--resume goes on from the last checkpoint"
 
 
 def pick_precision(precision: str, device: str) -> str:
@@ -51,19 +64,74 @@ def keep_freed_memory() -> None:
             mallopt(option, value)
 
 
-def make_fabric(device: str = "auto", precision: str = "auto", **options: Any) -> Any:
-    """Return a launched ``lightning_fabric.Fabric``.
+@contextlib.contextmanager
+def running_fabric(
+    device: str = "auto", precision: str = "auto", *, devices: int = 1, num_nodes: int = 1, command: Sequence[str] = ()
+) -> Iterator[Any]:
+    """Yield a launched ``lightning_fabric.Fabric``; with several processes, an error of any ends all, told once.
+
+    The first process raises it. The others raise SystemExit, for what they say would be said twice.
 
     Args:
         device: ``"auto"``, ``"cpu"``, ``"cuda"`` or ``"mps"``.
         precision: See `pick_precision`.
-        **options: Further arguments of Fabric (devices, num_nodes, strategy).
+        devices: Processes on this machine.
+        num_nodes: Machines.
+        command: Starts a further process of this machine, unless torchrun or SLURM has started them: it is to call
+            `follow`, and then to come here with the same arguments.
 
     Raises:
         BackendError: If the device is missing.
-        ConfigError: If Fabric refuses the combination.
+        ConfigError: If Fabric refuses the combination, or the port at which the processes are to meet is taken.
         MissingExtraError: Without the ``train`` extra.
+        TrainingError: If another process has failed.
     """
+    fabric = _build_fabric(device, precision, devices, num_nodes)
+    if devices == num_nodes == 1:
+        fabric.launch()
+        yield fabric
+        return
+    first = fabric.global_rank == 0
+    own = not fabric.strategy.cluster_environment.creates_processes_externally
+    threads = torch.get_num_threads()
+    environment = {name: os.environ.get(name) for name in ("MASTER_ADDR", "MASTER_PORT")}
+    others = _Others()
+    try:
+        if "OMP_NUM_THREADS" not in os.environ:
+            torch.set_num_threads(max(1, usable_cores() // devices))
+        if own:
+            others.start(fabric, command, devices, num_nodes)
+        _connect(fabric, devices, num_nodes)
+        yield fabric
+        if own:
+            others.join()
+    except TriLiteNetError as error:
+        if first or not _tell(str(error)):
+            raise
+        raise SystemExit(1) from error
+    except KeyboardInterrupt:
+        if first:
+            raise
+        raise SystemExit(130) from None
+    except RuntimeError as error:
+        if not (isinstance(error, torch.distributed.DistError) or "gloo" in str(error)):
+            raise
+        if first:
+            raise TrainingError(others.reason()) from error
+        raise SystemExit(1) from error
+    finally:
+        others.end()
+        if own and torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()  # so that another run may follow
+        torch.set_num_threads(threads)
+        if first:
+            for name, value in environment.items():
+                os.environ.pop(name, None)
+                if value is not None:
+                    os.environ[name] = value
+
+
+def _build_fabric(device: str, precision: str, devices: int, num_nodes: int) -> Any:
     lightning = import_extra("lightning_fabric", "train")
     if device == "cuda" and not torch.cuda.is_available():
         raise BackendError("no CUDA device is available; use --device cpu or auto")
@@ -75,17 +143,130 @@ def make_fabric(device: str = "auto", precision: str = "auto", **options: Any) -
     if accelerator == "cpu":
         keep_freed_memory()
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
-    settings = {"devices": 1, **options}
-    if settings["devices"] != 1 or settings.get("num_nodes", 1) != 1:
+    settings: dict[str, Any] = {"devices": devices, "num_nodes": num_nodes}
+    if devices != 1 or num_nodes != 1:
         # The other processes wait while the first validates, which on a CPU takes longer than the default half an hour.
-        strategies = import_extra("lightning_fabric.strategies", "train")
-        settings.setdefault("strategy", strategies.DDPStrategy(timeout=_PATIENCE))
+        strategy = import_extra("lightning_fabric.strategies", "train").DDPStrategy(timeout=_PATIENCE)
+        strategy._configure_launcher = lambda: None  # Fabric's would run the calling script again, which may be a REPL
+        settings["strategy"] = strategy
     try:
-        fabric = lightning.Fabric(accelerator=accelerator, precision=pick_precision(precision, accelerator), **settings)
+        return lightning.Fabric(accelerator=accelerator, precision=pick_precision(precision, accelerator), **settings)
     except (ValueError, TypeError) as error:
         raise ConfigError(f"device {device!r} with precision {precision!r}: {error}") from error
-    fabric.launch()
-    return fabric
+
+
+def _connect(fabric: Any, devices: int, num_nodes: int) -> None:
+    """Let the processes meet."""
+    try:
+        fabric.strategy.cluster_environment.validate_settings(num_devices=devices, num_nodes=num_nodes)
+    except ValueError as error:
+        raise ConfigError(" ".join(str(error).split())) from error
+    try:
+        fabric.launch()
+    except torch.distributed.DistError as error:
+        port = os.environ["MASTER_PORT"]
+        if "EADDRINUSE" in str(error):
+            raise ConfigError(
+                f"port {port}, at which the processes are to meet, is taken; set MASTER_PORT to a free one, or unset it"
+            ) from error
+        raise TrainingError(
+            f"the processes cannot meet at {os.environ['MASTER_ADDR']}:{port} ({str(error).splitlines()[0]}); "
+            "see that the first one runs, and that MASTER_ADDR and MASTER_PORT name its machine and a free port"
+        ) from error
+
+
+class _Others:
+    """The further processes of this machine that this one has started; none if something else starts them."""
+
+    def __init__(self) -> None:
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self._over = threading.Event()
+        self._first_rank = 0
+
+    def start(self, fabric: Any, command: Sequence[str], devices: int, num_nodes: int) -> None:
+        """Start them, and watch them.
+
+        Raises:
+            ConfigError: If they could not meet each other, or those of other machines.
+        """
+        if num_nodes > 1 and not {"MASTER_ADDR", "MASTER_PORT", "NODE_RANK"} <= os.environ.keys():
+            raise ConfigError(
+                f"{num_nodes} machines: start the command with torchrun or SLURM, "
+                "or on each with MASTER_ADDR, MASTER_PORT and NODE_RANK set"
+            )
+        if num_nodes == 1:
+            os.environ["MASTER_ADDR"] = "127.0.0.1"
+        place = fabric.strategy.cluster_environment
+        try:
+            meeting = {"MASTER_ADDR": place.main_address, "MASTER_PORT": str(place.main_port)}
+        except ValueError as error:
+            raise ConfigError(f"MASTER_PORT must be a number, got {os.environ['MASTER_PORT']!r}") from error
+        self._first_rank = fabric.global_rank
+        for rank in range(1, devices):
+            more = {**os.environ, **meeting, "LOCAL_RANK": str(rank)}
+            self._processes.append(subprocess.Popen(command, env=more, stdin=subprocess.PIPE))
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def _watch(self) -> None:
+        """End this process if another has failed and this one waits for it and does not notice, as on a GPU."""
+        while not self._over.wait(1.0):
+            if any(process.poll() for process in self._processes) and not self._over.wait(_GRACE):
+                log.error("%s", self.reason())
+                self.end()
+                os._exit(1)
+
+    def reason(self) -> str:
+        """Return why a run cannot go on: what another process said, or how it ended."""
+        with contextlib.suppress(RuntimeError, ValueError):
+            store = torch.distributed.distributed_c10d._get_default_store()
+            if store.check([_ERROR_KEY]):
+                return str(store.get(_ERROR_KEY).decode())
+        for _ in range(50):  # its connections close before it has quite ended
+            for rank, process in enumerate(self._processes, self._first_rank + 1):
+                code = process.poll() or 0
+                if code < 0:
+                    return (
+                        f"process {rank} was killed ({signal.Signals(-code).name}), mostly for want of memory; {RESUME}"
+                    )
+                if code:
+                    return f"process {rank} ended with exit code {code}, see what it said above; {RESUME}"
+            time.sleep(0.1 if self._processes else 0.0)
+        return f"another process of the run has gone, perhaps one of another machine; {RESUME}"
+
+    def join(self) -> None:
+        """Wait for their end."""
+        for process in self._processes:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(60.0)
+
+    def end(self) -> None:
+        """Kill those that are left."""
+        self._over.set()
+        for process in self._processes:
+            process.kill()
+            process.wait()
+            assert process.stdin is not None
+            process.stdin.close()
+
+
+def _tell(message: str) -> bool:
+    """Say to the first process why this one ends; return whether that could be said."""
+    try:
+        torch.distributed.distributed_c10d._get_default_store().set(_ERROR_KEY, message)
+    except (RuntimeError, ValueError):
+        return False
+    return True
+
+
+def follow() -> None:
+    """Make this process end with the one that started it: its standard input is a pipe that then ends."""
+
+    def wait() -> None:
+        while os.read(0, 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 class StopRequest:

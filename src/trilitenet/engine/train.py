@@ -80,6 +80,7 @@ class TrainResult:
         metrics: Figures of the last validation, by name.
         best: Best value so far of each task and overall.
         images_per_second: Training throughput, without validation.
+        first: Whether this is the first of the run's processes, which alone tells of it.
     """
 
     folder: Path
@@ -89,6 +90,7 @@ class TrainResult:
     metrics: dict[str, float]
     best: dict[str, float]
     images_per_second: float
+    first: bool = True
 
     @property
     def exit_code(self) -> int:
@@ -96,7 +98,9 @@ class TrainResult:
         return 0 if self.finished else 130
 
     def summary(self) -> str:
-        """Return one line a reader understands."""
+        """Return one line a reader understands; nothing for a process that is not the first."""
+        if not self.first:
+            return ""
         speed = f"after {self.steps} steps at {self.images_per_second:.1f} images/s"
         if not self.finished:
             return f"stopped {speed}; {self.folder / CHECKPOINT_NAME} holds its state, go on with --resume"
@@ -225,7 +229,8 @@ class Trainer:
             save_network(self.averaged, weights, self._card())
         self.fabric.barrier()
         speed = self.images / self.seconds if self.seconds else 0.0
-        return TrainResult(self.folder, weights, self.step, finished, self.metrics, self.best, speed)
+        first = self.fabric.is_global_zero
+        return TrainResult(self.folder, weights, self.step, finished, self.metrics, self.best, speed, first)
 
     def _run(self) -> bool:
         """Run the epochs; return whether the end was reached, by schedule or by early stopping."""

@@ -1,0 +1,158 @@
+"""Two processes on the CPU: the first in this one, or in one of its own where it is to be ended."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from trilitenet.engine import runtime
+from trilitenet.errors import ConfigError, DataError, TrainingError
+
+pytest.importorskip("lightning_fabric")
+
+SCRIPT = """
+import os, pathlib, signal, sys, time, torch
+from trilitenet.engine import runtime
+from trilitenet.errors import DataError, TriLiteNetError
+runtime._GRACE = 1.0
+second = "LOCAL_RANK" in os.environ
+code = sys.argv[1 + second]
+if second:
+    runtime.follow()
+try:
+    command = [sys.executable, __file__, *sys.argv[1:]]
+    with runtime.running_fabric("cpu", "32-true", devices=2, command=command) as fabric:
+        exec(code)
+except TriLiteNetError as error:
+    sys.exit(f"error: {error}")
+"""
+"""Takes the code of the first process and that of the second."""
+
+MEET = "fabric.barrier()"
+
+
+@pytest.fixture
+def script(tmp_path: Path) -> Path:
+    path = tmp_path / "script.py"
+    path.write_text(SCRIPT)
+    return path
+
+
+def pair(script: Path, second: str) -> Any:
+    """Return the context of a run whose second process does as it is told."""
+    command = [sys.executable, str(script), "", second]
+    return runtime.running_fabric("cpu", "32-true", devices=2, command=command)
+
+
+def ended(pid: int) -> bool:
+    """Return whether a process ends within ten seconds."""
+    for _ in range(100):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z":
+                time.sleep(0.1)
+                continue
+        return True
+    return False
+
+
+@pytest.mark.slow
+def test_runs_follow_one_another_and_leave_no_trace(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MASTER_ADDR", "192.0.2.1")  # left by something else
+    before, threads = dict(os.environ), torch.get_num_threads()
+    for _ in range(2):
+        with pair(script, "fabric.all_reduce(torch.tensor(3.0))") as fabric:
+            assert (fabric.global_rank, fabric.world_size) == (0, 2)
+            assert float(fabric.all_reduce(torch.tensor(1.0))) == 2.0
+    assert not torch.distributed.is_initialized()
+    assert (dict(os.environ), torch.get_num_threads()) == (before, threads)
+
+
+def test_the_first_process_tells_what_the_second_says(script: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with (
+        pytest.raises(TrainingError, match=r"^a\.jpg: is broken$"),
+        pair(script, "raise DataError('a.jpg: is broken')"),
+    ):
+        torch.distributed.barrier()
+    assert capfd.readouterr().err == ""
+
+
+def test_a_second_process_that_is_killed_is_told(script: Path) -> None:
+    with (
+        pytest.raises(TrainingError, match=r"process 1 was killed \(SIGKILL\), .*--resume goes on"),
+        pair(script, "os.kill(os.getpid(), signal.SIGKILL)"),
+    ):
+        torch.distributed.barrier()
+
+
+def test_the_second_process_is_quiet_when_the_first_fails(script: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    children: list[str] = []
+
+    def fail(fabric: Any) -> None:
+        fabric.barrier()
+        children.extend(Path(f"/proc/self/task/{threading.get_native_id()}/children").read_text().split())
+        raise DataError("mine")
+
+    with pytest.raises(DataError, match="mine"), pair(script, f"{MEET}; {MEET}") as fabric:
+        fail(fabric)
+    assert children
+    assert all(ended(int(child)) for child in children)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_port_that_is_taken_is_named(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket() as taken:
+        taken.bind(("", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        monkeypatch.setenv("MASTER_PORT", str(port))
+        with pytest.raises(ConfigError, match=f"port {port}, .* is taken; set MASTER_PORT"), pair(script, MEET):
+            pass
+    assert os.environ["MASTER_PORT"] == str(port)
+
+
+def test_processes_that_could_not_meet_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MASTER_PORT", "x")
+    with pytest.raises(ConfigError, match="MASTER_PORT must be a number, got 'x'"), pair(Path("none"), ""):
+        pass
+    monkeypatch.delenv("MASTER_PORT")
+    alone = runtime.running_fabric("cpu", num_nodes=2)
+    with pytest.raises(ConfigError, match="2 machines: start the command with torchrun"), alone:
+        pass
+
+
+@pytest.mark.slow
+def test_a_first_process_that_does_not_notice_is_ended(script: Path) -> None:
+    words = [sys.executable, str(script), "time.sleep(600)", "raise DataError('a.jpg: is broken')"]
+    done = subprocess.run(words, check=False, capture_output=True, text=True, timeout=200)
+    assert (done.returncode, done.stderr.splitlines()) == (1, ["a.jpg: is broken"])
+
+
+@pytest.mark.parametrize("meets", [True, False])
+def test_no_process_outlives_the_first(tmp_path: Path, script: Path, *, meets: bool) -> None:
+    """Neither one that has met it nor one that waits for it."""
+    told = tmp_path / "pid"
+    if not meets:
+        late = (
+            "runtime.follow(); pathlib.Path(sys.argv[0]).with_name('pid').write_text(str(os.getpid())); time.sleep(600)"
+        )
+        script.write_text(SCRIPT.replace("runtime.follow()", late))
+    second = f"pathlib.Path({str(told)!r}).write_text(str(os.getpid())); {MEET}"
+    words = [sys.executable, str(script), "time.sleep(600)", second]
+    with subprocess.Popen(words) as first:
+        for _ in range(1000):
+            if told.exists() and told.read_text():
+                break
+            time.sleep(0.1)
+        first.send_signal(signal.SIGKILL)
+    assert ended(int(told.read_text()))
