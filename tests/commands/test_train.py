@@ -532,6 +532,8 @@ def test_two_processes_follow_one(scenes: Path, tmp_path: Path) -> None:
         assert done.stdout.count("finished after 6 steps") == 1
         rows = read_csv(tmp_path / str(devices) / "metrics.csv")
         curves[devices] = [value for _, name, value in rows if name == "train/total"]
+        parts = [value for step, name, value in rows if step == 1 and "train/" in name and name != "train/total"]
+        assert sum(parts) == pytest.approx(curves[devices][0])  # of one process alone it is not
     assert len(curves[1]) == len(curves[2]) == 6
     assert curves[2] == pytest.approx(curves[1], rel=0.1)
 

@@ -268,13 +268,15 @@ class Trainer:
             sums += self._train_step(group)
             self.step += 1
             since += sum(len(batch) for batch in group) * self.fabric.world_size
-            if self.step % self.config.log_every == 0 or self.step >= self.steps or stop:
+            stopped = self._stopped(stop)
+            if self.step % self.config.log_every == 0 or self.step >= self.steps or stopped:
                 elapsed = time.perf_counter() - mark
                 self.seconds, self.images = self.seconds + elapsed, self.images + since
                 self._log_losses(epoch, sums, rate, since / elapsed)
                 sums.zero_()
                 mark, since = time.perf_counter(), 0
-            if self.step >= self.steps or self._stopped(stop):
+                stopped = self._stopped(stop)
+            if self.step >= self.steps or stopped:
                 break
         self.guard.look()
 
@@ -367,6 +369,9 @@ class Trainer:
         return bool(self.fabric.all_reduce(wish, reduce_op="sum") > 0)
 
     def _log_losses(self, epoch: int, sums: Tensor, rate: float, speed: float) -> None:
+        """Log the mean losses of all processes since the last time; every process takes part."""
+        if self.fabric.world_size > 1:
+            sums = self.fabric.all_reduce(sums.clone())
         *means, _ = (sums / sums[-1]).tolist()  # NaN where every step was left out
         losses = dict(zip(LossTerms._fields, means, strict=True))
         figures = {f"train/{name}": value for name, value in losses.items()}
