@@ -433,6 +433,51 @@ def test_a_prepared_data_set_is_trained_on_without_validation(scenes: Path, tmp_
     assert train(augmentation__mask_above=64, **options).steps == 1
 
 
+@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize("gone", [True, False])
+def test_an_image_that_vanishes_or_breaks_is_named_and_the_run_can_go_on(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int, *, gone: bool
+) -> None:
+    data = shutil.copytree(scenes, tmp_path / "data")
+    images = {path: path.read_bytes() for path in (data / "images" / "train").iterdir()}
+    plain = CsvLogger.log
+
+    def log(self: CsvLogger, values: Any, step: int) -> None:
+        plain(self, values, step)
+        for path in images if step == 2 else ():
+            path.unlink()
+            if not gone:
+                path.write_bytes(b"broken")
+
+    monkeypatch.setattr(CsvLogger, "log", log)
+    options = settings(data, tmp_path / "run", workers=workers, max_steps=30, samples_per_epoch=400)
+    with pytest.raises(DataError, match=r"train/synthetic_\w+\.jpg: .*; once that is mended, --resume") as caught:
+        train(**options)
+    assert "\n" not in str(caught.value)
+    monkeypatch.setattr(CsvLogger, "log", plain)
+    for path, content in images.items():
+        path.write_bytes(content)
+    steps = state(tmp_path / "run")["step"]
+    assert 2 <= steps < 30
+    assert train(resume=True, **options | {"max_steps": steps + 1}).steps == steps + 1
+
+
+def test_a_reading_process_that_is_killed_is_told_in_one_line(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    others, plain = set(multiprocessing.active_children()), CsvLogger.log
+
+    def log(self: CsvLogger, values: Any, step: int) -> None:
+        plain(self, values, step)
+        for worker in set(multiprocessing.active_children()) - others if step == 3 else ():
+            worker.kill()
+
+    monkeypatch.setattr(CsvLogger, "log", log)
+    with pytest.raises(TrainingError, match=r"reads images was ended .*--workers .*--resume") as caught:
+        train(**settings(scenes, tmp_path, max_steps=30, workers=1, samples_per_epoch=400))
+    assert "\n" not in str(caught.value)
+
+
 def test_resuming_takes_the_anchors_for_distillation_too(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

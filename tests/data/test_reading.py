@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -14,7 +16,7 @@ from trilitenet.data.description import (
     read_description,
     write_description,
 )
-from trilitenet.data.reading import DrivingDataset, MixedDataset, decode_image, sampling_weights
+from trilitenet.data.reading import DrivingDataset, MixedDataset, decode_image, decode_mask, sampling_weights
 from trilitenet.data.sample import Sample
 from trilitenet.errors import DataError, ShapeError
 
@@ -221,3 +223,27 @@ def test_driving_frames(driving: Path) -> None:
     samples = [val[index] for index in range(0, len(val), 20)]
     assert all(sample.boxes is not None for sample in samples)
     assert {sample.attributes["condition"] for sample in samples} >= {"day", "night"}
+
+
+def test_files_that_cannot_be_read_are_named(root: Path) -> None:
+    dataset = DrivingDataset(root, "train")
+    lane = root / "ll_seg_annotations/train/train_0001.png"
+    lane.unlink()
+    lane.mkdir()
+    with pytest.raises(DataError, match=r"train_0001\.png: cannot be read \(Is a directory\)"):
+        dataset[1]
+    dataset.image_path(2).unlink()
+    with pytest.raises(DataError, match=r"train_0002\.\w+: the image is not there any more"):
+        dataset[2]
+
+
+def test_an_image_of_an_absurd_size_is_a_broken_one() -> None:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", 200_000, 200_000, 8, 2, 0, 0, 0)
+    data = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"0")) + chunk(b"IEND", b"")
+    with pytest.raises(DataError, match=r"huge\.png: not an image"):
+        decode_image(data, "huge.png")
+    with pytest.raises(DataError, match=r"huge\.png: not a mask"):
+        decode_mask(data, "huge.png", MaskMeaning())

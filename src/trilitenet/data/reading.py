@@ -80,10 +80,18 @@ def decode_image(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8
         DataError: If it is not an image, or a broken one.
     """
     buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes) else data
-    image = cv2.imdecode(buffer, _READ_RGB or cv2.IMREAD_COLOR) if len(buffer) else None
+    image = _decode(buffer, _READ_RGB or cv2.IMREAD_COLOR)
     if image is None:
         raise DataError(f"{name}: not an image that can be decoded; run `trilitenet data check` on the data set")
     return np.asarray(image if _READ_RGB else cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image), np.uint8)
+
+
+def _decode(buffer: NDArray[np.uint8], mode: int) -> NDArray[Any] | None:
+    """Decode by OpenCV, which returns None for most of what it cannot read, but refuses absurd sizes by an error."""
+    try:
+        return cv2.imdecode(buffer, mode) if len(buffer) else None
+    except cv2.error:
+        return None
 
 
 def decode_mask(
@@ -95,7 +103,7 @@ def decode_mask(
         DataError: If it is not an image, or a broken one.
     """
     buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes) else data
-    grey = cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE) if len(buffer) else None
+    grey = _decode(buffer, cv2.IMREAD_GRAYSCALE)
     if grey is None:
         raise DataError(f"{name}: not a mask that can be decoded; run `trilitenet data check` on the data set")
     if not meaning.ignore:
@@ -250,11 +258,14 @@ class DrivingDataset:
         """Read a sample.
 
         Raises:
-            DataError: If a file is broken, or a mask has another size than its image.
+            DataError: If a file is broken or cannot be read, or a mask has another size than its image.
         """
         name = self.names[index]
         path = self.image_path(index)
-        image = decode_image(np.fromfile(path, np.uint8), str(path))
+        data = _bytes_of(path)
+        if data is None:
+            raise DataError(f"{path}: the image is not there any more; run `trilitenet data check` on the data set")
+        image = decode_image(data, str(path))
         size = image.shape[:2]
         boxes = class_id = None
         ignored = np.zeros((0, 4), np.float32)
@@ -284,10 +295,11 @@ class DrivingDataset:
 
     def _annotation(self, name: str) -> Any:
         path = self.root / DETECTION_FOLDER / self.split / f"{name}.json"
-        try:
-            return json.loads(path.read_bytes())
-        except FileNotFoundError:
+        data = _bytes_of(path)
+        if data is None:
             return None
+        try:
+            return json.loads(data.tobytes())
         except ValueError as error:
             raise DataError(f"{path}: not JSON ({error})") from error
 
@@ -300,9 +312,8 @@ class DrivingDataset:
             (DRIVABLE_FOLDER, self.description.drivable) if task == "drivable" else (LANE_FOLDER, self.description.lane)
         )
         path = self.root / folder / self.split / f"{name}.png"
-        try:
-            data = np.fromfile(path, np.uint8)
-        except FileNotFoundError:
+        data = _bytes_of(path)
+        if data is None:
             return None, None
         mask, valid = decode_mask(data, str(path), meaning)
         if mask.shape != size:
@@ -397,6 +408,20 @@ def sampling_weights(dataset: SampleSource, table: Mapping[str, Mapping[str, flo
     if not weights.any():
         raise DataError("every sampling weight is 0")
     return weights
+
+
+def _bytes_of(path: Path) -> NDArray[np.uint8] | None:
+    """Return a file's content; None if there is no such file.
+
+    Raises:
+        DataError: If it is there and cannot be read.
+    """
+    try:
+        return np.fromfile(path, np.uint8)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
 def _image_files(root: Path, split: str) -> dict[str, str]:

@@ -25,9 +25,9 @@ from trilitenet.engine.loggers import RunLogger
 from trilitenet.engine.optim import Schedule, build_optimiser
 from trilitenet.engine.recipe import TrainConfig
 from trilitenet.engine.rescale import draw_size, rescale
-from trilitenet.engine.runtime import StopRequest
+from trilitenet.engine.runtime import RESUME, StopRequest
 from trilitenet.engine.transfer import keep_frozen
-from trilitenet.errors import ConfigError, WeightsError, brief, writing
+from trilitenet.errors import ConfigError, DataError, TrainingError, WeightsError, brief, writing
 from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.losses.multitask import LossTerms, MultiTaskLoss
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
@@ -207,7 +207,9 @@ class Trainer:
             build_loggers: Returns the loggers of a run that goes on from a step.
 
         Raises:
-            TrainingError: If the loss or gradient is not finite ten steps in a row.
+            DataError: If an image or label cannot be read.
+            TrainingError: If the loss or gradient is not finite ten steps in a row, or a process that reads images was
+                killed.
             WeightsError: If the checkpoint is damaged or of another run.
         """
         if resume is not None:
@@ -221,6 +223,17 @@ class Trainer:
             self.loggers = build_loggers(self.step)
         try:
             finished = self._run()
+        except DataError as error:
+            self.guard.look()
+            self.save()  # it came between two steps
+            raise DataError(f"{error}; once that is mended, {RESUME}") from error
+        except RuntimeError as error:
+            if not str(error).startswith("DataLoader worker"):
+                raise
+            raise TrainingError(
+                f"a process that reads images was ended ({' '.join(str(error).split())}), mostly for want of memory; "
+                f"lower --workers or --batch-size; {RESUME}"
+            ) from error
         finally:
             for logger in self.loggers:
                 logger.close()
