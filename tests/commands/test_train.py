@@ -433,6 +433,39 @@ def test_a_prepared_data_set_is_trained_on_without_validation(scenes: Path, tmp_
     assert train(augmentation__mask_above=64, **options).steps == 1
 
 
+def test_a_run_goes_on_with_its_own_data_alone(scenes: Path, tmp_path: Path) -> None:
+    data = shutil.copytree(scenes, tmp_path / "data")
+    options = settings(data, tmp_path / "run", classes=("vehicle", "person"))
+    train(**options, max_steps=1)
+    go_on = {"resume": True, "max_steps": 2}
+    with pytest.raises(WeightsError, match="trained on the classes vehicle, person, not person, vehicle;"):
+        train(**options | go_on | {"classes": ("person", "vehicle")})
+    write_dataset(tmp_path / "fewer", "train", 9, 0, size=(96, 160))
+    with pytest.raises(WeightsError, match="trained on 10 images, not 9;"):
+        train(**options | go_on | {"data": str(tmp_path / "fewer")})
+    other = shutil.copytree(data, tmp_path / "other")
+    images = sorted((other / "images" / "train").iterdir())
+    for image, next_one in zip(images, images[1:] + images[:1], strict=True):
+        image.write_bytes((data / "images" / "train" / next_one.name).read_bytes())
+    with pytest.raises(WeightsError, match="other images or labels of the same names;") as caught:
+        train(**options | go_on | {"data": str(other)})
+    assert "\n" not in str(caught.value)
+    images[0].rename(images[0].with_stem("unknown"))
+    with pytest.raises(WeightsError, match="trained on images of other names;"):
+        train(**options | go_on | {"data": str(other)})
+    moved = data.rename(tmp_path / "moved")
+    next((moved / "ll_seg_annotations" / "train").iterdir()).unlink()  # a label may be mended
+    assert train(**options | go_on | {"data": str(moved)}).steps == 2
+
+
+def test_a_checkpoint_that_does_not_name_its_data_is_taken(scenes: Path, tmp_path: Path) -> None:
+    train(**settings(scenes, tmp_path, max_steps=1))
+    whole = torch.load(tmp_path / "last.ckpt", weights_only=True)
+    del whole["data"]
+    torch.save(whole, tmp_path / "last.ckpt")
+    assert train(resume=True, **settings(scenes, tmp_path, max_steps=2)).steps == 2
+
+
 @pytest.mark.parametrize("workers", [0, 1])
 @pytest.mark.parametrize("gone", [True, False])
 def test_an_image_that_vanishes_or_breaks_is_named_and_the_run_can_go_on(

@@ -23,6 +23,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from trilitenet.commands.paths import text_paths
 from trilitenet.config import DEFAULT_ANCHORS, ModelCard
+from trilitenet.data.identity import identify
 from trilitenet.data.loader import build_loader
 from trilitenet.data.prepared import PreparedDataset, is_prepared, open_dataset
 from trilitenet.data.reading import DrivingDataset, MixedDataset, SampleSource, sampling_weights
@@ -123,6 +124,7 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
             loader,
             fabric,
             network.card,
+            identity=identify(dataset),
             validate=None if validation is None else lambda network: validation_figures(network, validation, device),
             teacher=_teacher(config, network),
             display=display,

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import csv
 import functools
+import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -237,6 +238,18 @@ class DrivingDataset:
         content = self._annotation(name)
         own = content.get("attributes") if isinstance(content, dict) else None
         return {str(key): str(value) for key, value in (own or {}).items()} | self._extra.get(name, {})
+
+    def fingerprint(self, index: int) -> str:
+        """Return a hash of a sample's files and of what their values mean; files that are missing are left out."""
+        name, about = self.names[index], self.description
+        meaning = (self._table, about.ignore, self._tasks, about.drivable, about.lane)
+        digest = hashlib.sha256(repr(meaning).encode())
+        labels = ((DETECTION_FOLDER, ".json"), (DRIVABLE_FOLDER, ".png"), (LANE_FOLDER, ".png"))
+        paths = [self.root / folder / self.split / f"{name}{ending}" for folder, ending in labels]
+        for path in (self.image_path(index), *paths):
+            data = _bytes_of(path)
+            digest.update(b"-" if data is None else hashlib.sha256(data.tobytes()).digest())
+        return digest.hexdigest()[:16]
 
     def foreign_categories(self) -> tuple[str, ...]:
         """Return the categories of the boxes if none of them is in a class, else nothing; reads up to the first."""

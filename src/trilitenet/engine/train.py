@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from trilitenet.config import ModelCard
 from trilitenet.data.batches import Batch
+from trilitenet.data.identity import tell_apart
 from trilitenet.engine.checkpoint import random_state, read_checkpoint, set_random_state, write_checkpoint
 from trilitenet.engine.ema import MovingAverage
 from trilitenet.engine.guard import FiniteGuard
@@ -130,6 +131,7 @@ class Trainer:
         loader: Training batches, ``batch_size / accumulate`` images each.
         fabric: A launched ``lightning_fabric.Fabric``.
         card: What the weights' file is to say of them.
+        identity: Of the training data, see `trilitenet.data.identity`; a checkpoint of other data is refused.
         validate: Returns figures of a network by name; see `FIGURES` for those that tell what is best.
         teacher: A network to distil from, and the loss for it.
         display: Shows the run.
@@ -144,6 +146,7 @@ class Trainer:
         fabric: Any,
         card: ModelCard,
         *,
+        identity: Mapping[str, Any] | None = None,
         validate: Callable[[TriLiteNet], Mapping[str, float]] | None = None,
         teacher: tuple[TriLiteNet, DistillationLoss] | None = None,
         display: Display | None = None,
@@ -152,6 +155,7 @@ class Trainer:
         self.fabric = fabric
         self.loader = loader
         self.card = card
+        self.identity = identity
         self.validate = validate
         self.display = display
         self.folder = Path(config.output)
@@ -417,6 +421,7 @@ class Trainer:
             {
                 "config": self.config.to_dict(),
                 "classes": self.network.classes,
+                "data": self.identity,
                 "step": self.step,
                 "network": self.network.state_dict(),
                 "ema": None if self.ema is None else self.ema.state_dict(),
@@ -435,7 +440,7 @@ class Trainer:
         """Take over the state of a checkpoint.
 
         Raises:
-            WeightsError: If it is damaged, or of a run with another network, batch or class count.
+            WeightsError: If it is damaged, or of a run with another network, batch, class count or data set.
         """
         state = read_checkpoint(path)
         ours, theirs = self.config.to_dict(), state["config"]
@@ -445,6 +450,13 @@ class Trainer:
                 raise WeightsError(
                     f"{path}: was trained with {name} {theirs[name]!r}, this run has {ours[name]!r}; "
                     "set it alike, or start anew with --init"
+                )
+        if state.get("data") and self.identity:
+            difference = tell_apart(state["data"], self.identity)
+            if difference:
+                raise WeightsError(
+                    f"{path}: was trained on {difference}; give the same --data and --classes, or start anew with "
+                    "--overwrite or another --output"
                 )
         try:
             self._take_over(state)
