@@ -569,6 +569,22 @@ def test_a_table_is_trained_once_and_printed(scenes: Path, tmp_path: Path) -> No
     assert re.search(r"\| With \| - \| - \| \d+\.\d \| - \| - \| 0\.0\d \| 0\.0\d \|", text)
     assert result.rows[1].parameters < result.rows[0].parameters
     assert result.exit_code == 0
+    again: dict[str, Any] = {"data": scenes, "output": tmp_path / "runs"}
+    with pytest.raises(OutputError, match=r"runs/a: was trained with epochs 1, now 2 is asked for; give another"):
+        train_table(table, **again, settings=yaml.safe_dump(more | {"epochs": 2}))
+    (tmp_path / "b.yaml").write_text("base: a.yaml\npcaa: false\naugmentation: {flip: 0.1}\n")
+    with pytest.raises(OutputError, match=r"runs/b: was trained with augmentation\.flip 0\.5, now 0\.1 is asked"):
+        train_table(table, **again, settings=yaml.safe_dump(more))
+    (tmp_path / "b.yaml").write_text("base: a.yaml\npcaa: false\n")
+    data = shutil.copytree(scenes, tmp_path / "data")
+    moved: dict[str, Any] = again | {"data": data, "settings": yaml.safe_dump(more | {"workers": 1})}
+    assert train_table(table, **moved).summary() == text
+    next((data / "da_seg_annotations" / "train").iterdir()).unlink()
+    with pytest.raises(OutputError, match="runs/a: was trained on other images or labels of the same names;"):
+        train_table(table, **moved)
+    (tmp_path / "runs" / "a" / "config.yaml").unlink()
+    with pytest.raises(OutputError, match="what it was trained with cannot be told"):
+        train_table(table, **moved)
 
 
 def test_the_command_line_takes_every_field(scenes: Path, tmp_path: Path) -> None:

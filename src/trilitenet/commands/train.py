@@ -49,7 +49,7 @@ from trilitenet.models.trilitenet import TriLiteNet, build_network
 from trilitenet.models.weights import load_network
 from trilitenet.structures import Boxes, Perception
 
-__all__ = ["build_loss", "train", "validation_figures"]
+__all__ = ["build_loss", "train", "training_data", "validation_figures"]
 
 _YAML_FLAGS: Final = ("anchors", "sampling", "extra_data")
 """Fields whose flag takes YAML, for example --sampling '{timeofday: {night: 2}}'."""
@@ -99,7 +99,7 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
     folder = Path(config.output)
     torch.manual_seed(config.seed)
     with _Display(quiet=not fabric.is_global_zero) as display:
-        dataset = _training_data(config)
+        dataset = training_data(config)
         loader = build_loader(
             dataset,
             _transform(config, dataset, display),
@@ -167,7 +167,8 @@ def _take_part() -> None:
         raise SystemExit(1) from error
 
 
-def _training_data(config: TrainConfig) -> SampleSource:
+def training_data(config: TrainConfig) -> SampleSource:
+    """Open the data that a recipe trains on."""
     above = config.augmentation.mask_above
     first = open_dataset(
         config.data, config.train_split, canvas=config.input_size, class_names=config.classes, mask_above=above

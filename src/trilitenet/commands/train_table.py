@@ -10,16 +10,25 @@ import yaml
 
 from trilitenet.commands.paths import text_paths
 from trilitenet.commands.tables import markdown_row
-from trilitenet.commands.train import train
+from trilitenet.commands.train import train, training_data
 from trilitenet.config import read_yaml
+from trilitenet.data.identity import identify, tell_apart
+from trilitenet.engine.checkpoint import read_checkpoint
+from trilitenet.engine.recipe import TrainConfig, read_recipe
 from trilitenet.engine.train import CHECKPOINT_NAME
-from trilitenet.errors import ConfigError, brief
+from trilitenet.errors import ConfigError, OutputError, brief
 from trilitenet.models.cost import count_multiply_adds, count_parameters
 from trilitenet.models.weights import load_network
 
 __all__ = ["TableResult", "TableRow", "train_table"]
 
 _FIGURES: Final = ("detection/recall", "detection/ap50", "drivable/miou", "lane/accuracy", "lane/iou")
+_WEIGHTS: Final = "final.safetensors"
+_FREE: Final = frozenset(
+    {"data", "output", "device", "devices", "num_nodes", "workers", "compile"}
+    | {"loggers", "log_every", "pictures", "checkpoint_every"}
+)
+"""Settings in which a row that is done may differ from what is asked for: the data's content is compared by itself."""
 _HEADINGS: Final = ("Recall (%)", "mAP@0.5 (%)", "Drivable mIoU (%)", "Lane Acc (%)", "Lane IoU (%)")
 
 
@@ -88,6 +97,9 @@ def train_table(table: Path, /, *, data: Path, output: Path, resume: bool = Fals
 
     Returns:
         The table.
+
+    Raises:
+        OutputError: If a row that is done was trained with other settings or on other data.
     """
     title, recipes = _read(table)
     try:
@@ -96,15 +108,19 @@ def train_table(table: Path, /, *, data: Path, output: Path, resume: bool = Fals
         more = None
     if not isinstance(more, dict) or {"data", "output"} & more.keys():
         raise ConfigError(f"settings must be YAML such as '{{epochs: 10}}', without data and output, got {settings!r}")
+    fields: dict[str, Any] = {**more, "data": str(data)}
+    for recipe in recipes.values():
+        folder = output / recipe.stem
+        if (folder / _WEIGHTS).is_file():
+            _check_done(folder, read_recipe(recipe, fields))
     rows: list[TableRow] = []
     for name, recipe in recipes.items():
         folder = output / recipe.stem
-        weights = folder / "final.safetensors"
+        weights = folder / _WEIGHTS
         finished = weights.is_file()
         if not finished:
             going_on = resume and (folder / CHECKPOINT_NAME).is_file()
-            fields: dict[str, Any] = {**more, "data": str(data), "output": str(folder)}
-            finished = train(recipe, resume=going_on, overwrite=not going_on, **fields).finished
+            finished = train(recipe, resume=going_on, overwrite=not going_on, **fields, output=str(folder)).finished
         if not finished:
             break
         network = load_network(weights)
@@ -113,6 +129,36 @@ def train_table(table: Path, /, *, data: Path, output: Path, resume: bool = Fals
             TableRow(name, figures, count_parameters(network), count_multiply_adds(network, network.card.input_size))
         )
     return TableResult(title, tuple(rows), len(rows) == len(recipes))
+
+
+def _check_done(folder: Path, config: TrainConfig) -> None:
+    """Refuse a row that was trained with other settings or on other data than it would be now.
+
+    Raises:
+        OutputError: If so, or if that cannot be told.
+    """
+    cure = "give another --output, or remove the folder to train it anew"
+    try:
+        old, new = (_flat(settings.to_dict()) for settings in (read_recipe(folder / "config.yaml"), config))
+    except ConfigError as error:
+        raise OutputError(f"{folder}: what it was trained with cannot be told ({error}); {cure}") from error
+    for name in sorted((old.keys() | new.keys()) - _FREE):
+        if old.get(name) != new.get(name):
+            asked = f"was trained with {name} {old.get(name)!r}, now {new.get(name)!r} is asked for"
+            raise OutputError(f"{folder}: {asked}; {cure}")
+    checkpoint = folder / CHECKPOINT_NAME
+    identity = read_checkpoint(checkpoint).get("data") if checkpoint.is_file() else None
+    difference = tell_apart(identity, identify(training_data(config)), strict=True) if identity else None
+    if difference:
+        raise OutputError(f"{folder}: was trained on {difference}; {cure}")
+
+
+def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return settings with those of mappings within under names such as ``augmentation.flip``."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat
 
 
 def _read(table: Path) -> tuple[str, dict[str, Path]]:
