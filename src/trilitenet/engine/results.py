@@ -94,5 +94,5 @@ def _plot(path: Path, curves: Mapping[str, tuple[list[int], list[float]]], *, lo
         axes.set_ylim(bottom=max(axes.get_ylim()[0], highest / 1e4))  # a term next to nothing flattens no other
     axes.set_xlabel("step")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, loc="upper right" if log else "lower right")  # losses fall, figures rise
     figure.savefig(path, dpi=100)
