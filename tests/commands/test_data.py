@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
+import shutil
+import tarfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -13,7 +17,7 @@ from tests.data.published import write_published
 from tests.formats.readers import raw_bdd
 from trilitenet.apps.cli import main
 from trilitenet.commands.data import _widths, check, convert, prepare, show
-from trilitenet.commands.train import _training_data
+from trilitenet.commands.train import training_data
 from trilitenet.data.prepared import PreparedDataset, open_dataset
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.recipe import TrainConfig
@@ -58,6 +62,45 @@ def test_convert_options(raw: Path, tmp_path: Path) -> None:
     assert dataset.class_names == ("small", "large")
     assert dataset.description.licence == "mine"
     assert not (tmp_path / "out/images/val").exists()
+
+
+@pytest.mark.parametrize("images", ["link", "copy"])
+def test_a_full_disk_is_told_in_one_line(
+    raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, images: Literal["link", "copy"]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "the source")
+
+    with monkeypatch.context() as patch:
+        owner, name = (Path, "write_bytes") if images == "link" else (shutil, "copy2")
+        patch.setattr(owner, name, full)
+        with pytest.raises(OutputError, match=r"cannot be written .*No space left on device\)$"):
+            convert("bdd100k", raw, tmp_path / "out", images=images, workers=1)
+    assert not list((tmp_path / "out").rglob("*.part"))
+    convert("bdd100k", raw, tmp_path / "out", images=images, workers=1)
+
+
+def test_a_full_disk_is_told_in_one_line_when_preparing(published: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(tarfile.TarFile, "addfile", full)
+    with pytest.raises(OutputError, match=r"\.prepared: cannot be written \(No space left on device\)$"):
+        prepare(published, workers=1)
+
+
+def test_a_report_is_whole_or_not_there(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def half(path: Path, data: bytes) -> None:
+        with path.open("wb") as file:
+            file.write(data[:10])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_bytes", half)
+    with pytest.raises(OutputError, match=r"a\.html: cannot be written \(No space left on device\)"):
+        check(published, html=tmp_path / "a.html", workers=1)
+    with pytest.raises(OutputError, match=r"a\.jpg: cannot be written \(No space left on device\)"):
+        show(published, tmp_path / "a.jpg", count=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 
 def test_convert_wants_its_words(raw: Path, tmp_path: Path) -> None:
@@ -156,6 +199,6 @@ def test_prepare_and_read_back(published: Path, tmp_path: Path, capsys: pytest.C
 
 
 def test_training_uses_the_prepared_copy(published: Path) -> None:
-    assert isinstance(_training_data(TrainConfig(data=str(published))), DrivingDataset)
+    assert isinstance(training_data(TrainConfig(data=str(published))), DrivingDataset)
     prepare(published, workers=1)
-    assert isinstance(_training_data(TrainConfig(data=str(published))), PreparedDataset)
+    assert isinstance(training_data(TrainConfig(data=str(published))), PreparedDataset)

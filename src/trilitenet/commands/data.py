@@ -29,7 +29,7 @@ from trilitenet.data.prepared import prepare as run_preparation
 from trilitenet.data.reading import IMAGE_FOLDER, DrivingDataset
 from trilitenet.data.records import RecordSource
 from trilitenet.data.sample import Sample
-from trilitenet.errors import ConfigError, DataError, OutputError, writing
+from trilitenet.errors import ConfigError, DataError, OutputError, replacing, writing
 from trilitenet.formats.readers.bdd100k import read_bdd100k
 from trilitenet.formats.readers.coco import read_coco
 from trilitenet.formats.readers.cvat import read_cvat
@@ -320,10 +320,10 @@ def show(
         samples = [dataset[index] for dataset, indices in groups.values() for index in indices]
         names = next(iter(groups.values()))[0].class_names
         sheet = contact_sheet(samples, names, columns=columns, size=(width * 9 // 16, width))
-        with writing(output):
-            output.parent.mkdir(parents=True, exist_ok=True)
-        if not cv2.imwrite(str(output), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR)):
-            raise OutputError(f"{output}: cannot be written")
+        done, data = cv2.imencode(output.suffix, cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
+        if not done:
+            raise OutputError(f"{output}: a sheet of {sheet.shape[1]}x{sheet.shape[0]} pixels cannot be encoded")
+        _write(output, data.tobytes())
     return Shown(output, shown)
 
 
@@ -496,10 +496,16 @@ def _workers(workers: int) -> int:
     return 0 if count == 1 else count
 
 
-def _write(path: Path, text: str) -> None:
+def _write(path: Path, content: str | bytes) -> None:
+    """Write a file whole or not at all; what is a device or a link, such as /dev/stdout, stays what it is."""
+    data = content.encode() if isinstance(content, str) else content
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
+        if path.is_symlink() or (path.exists() and not path.is_file()):
+            path.write_bytes(data)
+            return
+        with replacing(path) as part:
+            part.write_bytes(data)
 
 
 def _rendered(table: Table) -> str:

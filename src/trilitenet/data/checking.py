@@ -6,7 +6,6 @@ annotation is read. Of each image only a few hundred bytes are kept, so memory s
 
 from __future__ import annotations
 
-import concurrent.futures
 import dataclasses
 import functools
 import hashlib
@@ -14,7 +13,6 @@ import io
 import itertools
 import json
 import math
-import multiprocessing
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -38,6 +36,7 @@ from trilitenet.data.reading import (
     read_index,
 )
 from trilitenet.errors import DataError, import_extra
+from trilitenet.processing.cores import ProcessPool
 from trilitenet.processing.images import orientation
 
 __all__ = ["KINDS", "CheckReport", "Finding", "check_dataset", "detect_layout"]
@@ -321,8 +320,7 @@ def _run(job: _Job, work: list[tuple[str, str]], workers: int) -> Iterator[_Fact
     if workers <= 0 or len(work) < 64:
         yield from map(job, work)
         return
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context, initializer=_start) as pool:
+    with ProcessPool(workers, _start) as pool:
         yield from pool.map(job, work, chunksize=64)
 
 

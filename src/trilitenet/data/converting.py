@@ -7,7 +7,6 @@ done and what was left out, so a conversion that was interrupted goes on where i
 from __future__ import annotations
 
 import collections
-import concurrent.futures
 import contextlib
 import csv
 import dataclasses
@@ -16,7 +15,6 @@ import io
 import json
 import logging
 import math
-import multiprocessing
 import os
 import shutil
 from collections import Counter
@@ -52,6 +50,7 @@ from trilitenet.data.records import (
     image_size,
 )
 from trilitenet.errors import ConfigError, DataError, OutputError, replacing, writing
+from trilitenet.processing.cores import ProcessPool
 
 __all__ = ["ConversionOptions", "ConversionReport", "convert", "drivable_mask", "lane_mask"]
 
@@ -163,7 +162,8 @@ def convert(
         progress: Called with (images done, images in all).
 
     Raises:
-        OutputError: If ``out`` holds something else, or a conversion with other options or of another source.
+        OutputError: If ``out`` holds something else, or a conversion with other options or of another source; or if it
+            cannot be written.
         DataError: If a split is unknown.
     """
     options = options or ConversionOptions()
@@ -180,14 +180,15 @@ def convert(
     finished = 0
     if progress:
         progress(finished, total)
-    for split, wanted in names.items():
-        for _ in _convert_split(source, split, wanted, root, options, workers):
-            finished += 1
-            if progress:
-                progress(finished, total)
-    journals = _read_journals(state, source.splits)
-    report = _report(journals)
-    _finish(root, options, description, report, journals)
+    with writing(root):
+        for split, wanted in names.items():
+            for _ in _convert_split(source, split, wanted, root, options, workers):
+                finished += 1
+                if progress:
+                    progress(finished, total)
+        journals = _read_journals(state, source.splits)
+        report = _report(journals)
+        _finish(root, options, description, report, journals)
     return report
 
 
@@ -355,10 +356,7 @@ def _run(
     if workers <= 0 or len(items) < 2:
         yield from map(job, items)
         return
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(
-        workers, mp_context=context, initializer=_start, initargs=(job,)
-    ) as pool:
+    with ProcessPool(workers, _start, (job,)) as pool:
         yield from pool.map(_work, items, chunksize=max(1, min(32, len(items) // (workers * 4))))
 
 
@@ -512,12 +510,14 @@ def _place_image(source: Path, target: Path, options: ConversionOptions) -> None
     part = target.with_name(f".{target.name}.part")
     part.unlink(missing_ok=True)
     if options.images == "link":
-        try:
+        with contextlib.suppress(OSError):
             os.link(source, part)
-        except OSError:
+    if not part.exists():
+        try:
             shutil.copy2(source, part)
-    else:
-        shutil.copy2(source, part)
+        except OSError as error:  # which names the source
+            part.unlink(missing_ok=True)
+            raise OutputError(f"{target}: cannot be written as a copy of {source} ({error.strerror})") from error
     part.replace(target)
 
 
@@ -543,7 +543,7 @@ def _open_state(root: Path, options: ConversionOptions, origin: Mapping[str, str
         for part in root.rglob(".*.part"):
             part.unlink()
         return state
-    if root.is_dir() and any(root.iterdir()):
+    if root.is_dir() and any(child != state for child in root.iterdir()):  # the state may have failed to be written
         raise OutputError(f"{root}: is not empty and not of an earlier conversion; choose another folder")
     with writing(root):
         state.mkdir(parents=True, exist_ok=True)

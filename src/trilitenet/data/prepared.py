@@ -21,7 +21,6 @@ import hashlib
 import io
 import json
 import logging
-import multiprocessing
 import re
 import shutil
 import tarfile
@@ -47,6 +46,7 @@ from trilitenet.data.reading import (
 )
 from trilitenet.data.sample import VALID, Sample
 from trilitenet.errors import ConfigError, DataError, OutputError, import_extra, replacing, writing
+from trilitenet.processing.cores import ProcessPool
 from trilitenet.processing.letterbox import Letterbox
 
 __all__ = ["PREPARED_FILE", "PreparedDataset", "is_prepared", "open_dataset", "prepare", "shrink"]
@@ -168,11 +168,12 @@ def prepare(
     total = sum(map(len, datasets.values()))
     done = 0
     _forget(plan, datasets)
-    for count in _run_jobs(plan, jobs, workers):
-        done += count
-        if progress:
-            progress(done, total)
-    _write_state(plan, datasets)
+    with writing(out):
+        for count in _run_jobs(plan, jobs, workers):
+            done += count
+            if progress:
+                progress(done, total)
+        _write_state(plan, datasets)
     return {split: len(dataset) for split, dataset in datasets.items()}
 
 
@@ -392,8 +393,7 @@ def _run_jobs(plan: _Plan, jobs: list[tuple[str, int, list[str]]], workers: int)
         for job in jobs:
             yield _write_shard(plan, *job)
         return
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
+    with ProcessPool(workers) as pool:
         futures = [pool.submit(_write_shard, plan, *job) for job in jobs]
         for future in concurrent.futures.as_completed(futures):
             yield future.result()

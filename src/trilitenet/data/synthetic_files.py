@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import concurrent.futures
 import functools
 import json
-import multiprocessing
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
@@ -18,6 +16,7 @@ from trilitenet.data.description import DESCRIPTION_FILE, DatasetDescription, wr
 from trilitenet.data.sample import Sample
 from trilitenet.data.synthetic import SyntheticScenes
 from trilitenet.errors import ConfigError, OutputError
+from trilitenet.processing.cores import ProcessPool
 
 __all__ = ["annotation", "write_dataset", "write_sample"]
 
@@ -87,8 +86,7 @@ def write_dataset(
                 if progress:
                     progress(done + 1)
             return
-        context = multiprocessing.get_context("spawn")
-        with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
+        with ProcessPool(workers) as pool:
             for done, _ in enumerate(pool.map(job, range(count), chunksize=4)):
                 if progress:
                     progress(done + 1)

@@ -1,12 +1,97 @@
-"""How many processor cores there are to work with."""
+"""Processor cores: how many there are to work with, and processes that use them."""
 
 from __future__ import annotations
 
+import concurrent.futures
+import contextlib
+import multiprocessing
 import os
+import signal
+from collections.abc import Callable, Iterator
+from types import FrameType, TracebackType
+from typing import Any, TypeVar
 
-__all__ = ["usable_cores"]
+__all__ = ["ProcessPool", "usable_cores"]
+
+T = TypeVar("T")
 
 
 def usable_cores() -> int:
     """Return on how many processor cores this process may run, which a container or `taskset` may limit."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class ProcessPool(concurrent.futures.ProcessPoolExecutor):
+    """Processes that Ctrl-C in the terminal, which reaches all of them, ends without a word.
+
+    What a process is at is interrupted, so that it cleans up; what waits is forgotten.
+
+    Args:
+        workers: How many.
+        initializer: Called first in each.
+        initargs: What it is called with.
+    """
+
+    def __init__(
+        self, workers: int, initializer: Callable[..., object] | None = None, initargs: tuple[Any, ...] = ()
+    ) -> None:
+        heeds = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN  # which a shell's background job does not
+        super().__init__(
+            workers,
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=_begin,
+            initargs=(heeds, initializer, initargs),
+        )
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> concurrent.futures.Future[T]:
+        """Add a task."""
+        with _held_back():  # in a process that starts with this task, too, until it can do without a word
+            return super().submit(_interruptible, fn, *args, **kwargs)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.shutdown(wait=True, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _held_back() -> Iterator[None]:
+    """Let Ctrl-C wait for the end of the block, where the system can; processes started in it begin so."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+_busy = _stopped = False
+
+
+def _begin(heeds: bool, initializer: Callable[..., object] | None, initargs: tuple[Any, ...]) -> None:
+    signal.signal(signal.SIGINT, _stop if heeds else signal.SIG_IGN)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    if initializer is not None:
+        initializer(*initargs)
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
+    """Interrupt the task at hand, and refuse those that are handed over already."""
+    global _stopped
+    _stopped = True
+    if _busy:
+        raise KeyboardInterrupt
+
+
+def _interruptible(function: Callable[..., T], /, *args: Any, **kwargs: Any) -> T:
+    global _busy
+    if _stopped:
+        raise KeyboardInterrupt
+    _busy = True
+    try:
+        return function(*args, **kwargs)
+    finally:
+        _busy = False

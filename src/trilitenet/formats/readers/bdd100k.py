@@ -318,6 +318,8 @@ def _entries(files: _Split, name: str) -> Iterator[tuple[Any, Path]]:
             text = path.read_bytes()
         except FileNotFoundError:
             return
+        except OSError as error:
+            raise DataError(f"{path}: cannot be read ({error.strerror})") from error
         yield _parse(text, path), path
 
 

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from trilitenet.processing.cores import ProcessPool
+
+SCRIPT = """
+import signal, sys, time
+from trilitenet.processing.cores import ProcessPool
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore it
+    try:
+        with ProcessPool(3) as pool:
+            tasks = [pool.submit(time.sleep, seconds) for seconds in (60, 60, 0, 0)]
+            if sys.argv[1] == "busy":
+                tasks[2].result()
+            print("begun", flush=True)
+            tasks[0].result()
+    except KeyboardInterrupt:
+        print("interrupted", flush=True)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="no process groups")
+@pytest.mark.parametrize("when", ["starting", "busy"])
+def test_ctrl_c_in_the_terminal_ends_all_processes_without_a_word(when: str) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, when],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "begun\n"
+        began = time.monotonic()
+        os.killpg(process.pid, signal.SIGINT)
+        printed, complaints = process.communicate(timeout=55)
+    assert (printed, complaints) == ("interrupted\n", "")
+    assert time.monotonic() - began < 50
+
+
+def test_a_pool_works_and_tells_errors() -> None:
+    with ProcessPool(2) as pool:
+        assert list(pool.map(abs, [-1, 2, -3])) == [1, 2, 3]
+        with pytest.raises(ValueError, match="invalid literal"):
+            pool.submit(int, "x").result()
