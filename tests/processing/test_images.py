@@ -1,7 +1,10 @@
 from __future__ import annotations
 
 import io
+import os
 import struct
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +72,33 @@ def test_all_orientations_agree_with_pillow(orientation: int) -> None:
     data = encoded(Image.fromarray(gradient()), "PNG", exif=exif)
     upright = ImageOps.exif_transpose(Image.open(io.BytesIO(data)))
     np.testing.assert_array_equal(read_image(data), np.asarray(upright))
+
+
+@pytest.mark.skipif(not os.access("/proc/self/clear_refs", os.W_OK), reason="the most memory cannot be measured here")
+@pytest.mark.parametrize(
+    ("mode", "format", "most"), [("RGB", "JPEG", 11), ("RGBA", "PNG", 11), ("I;16", "PNG", 11), ("RGBA", "WEBP", 18)]
+)
+def test_reading_takes_few_copies(tmp_path: Path, mode: str, format: str, most: int) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    path = tmp_path / "large"
+    Image.new(mode, (3000, 2000)).save(path, format, exif=exif)
+    script = """
+import sys
+from pathlib import Path
+from trilitenet.processing.images import read_image
+
+def memory(name):
+    return next(int(line.split()[1]) for line in Path("/proc/self/status").read_text().splitlines() if name in line)
+
+data = Path(sys.argv[1]).read_bytes()
+Path("/proc/self/clear_refs").write_text("5")
+before = memory("VmRSS")
+assert read_image(data).shape == (3000, 2000, 3)
+print(1024 * (memory("VmHWM") - before) / 6_000_000)
+"""
+    done = subprocess.run([sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=True)
+    assert 3 < float(done.stdout) <= most
 
 
 def test_other_tags_in_exif_do_not_matter() -> None:

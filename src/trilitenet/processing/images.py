@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import struct
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,16 +23,19 @@ IMAGE_SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".t
 _BROKEN = (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error, Image.DecompressionBombError)
 """What Pillow's decoders raise on broken files."""
 
-_TURNS: Final = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
+_TURNS: Final[dict[int, Callable[[NDArray[np.uint8]], NDArray[np.uint8]]]] = {
+    2: lambda upright: upright[:, ::-1],
+    3: lambda upright: upright[::-1, ::-1],
+    4: lambda upright: upright[::-1],
+    5: lambda upright: upright.swapaxes(0, 1),
+    6: lambda upright: np.rot90(upright, 1),
+    7: lambda upright: upright.swapaxes(0, 1)[::-1, ::-1],
+    8: lambda upright: np.rot90(upright, -1),
 }
-"""What makes an image upright, by its orientation in EXIF."""
+"""The rows and columns of a file as a view of the upright picture, by the file's orientation in EXIF."""
+
+_BAND: Final = 64
+"""Rows that are converted at once: as a whole, each step would hold a copy of the picture, and wait for memory."""
 
 _HEIF: Final = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 """Brands of HEIC and HEIF files, the photos of many phones."""
@@ -110,11 +114,20 @@ def to_rgb(array: NDArray[Any]) -> NDArray[np.uint8]:
 def _decode(image: Image.Image, name: str) -> NDArray[np.uint8]:
     try:
         image.load()
-        if (turn := _TURNS.get(orientation(image))) is not None:
-            image = image.transpose(turn)
-        if image.mode in {"I", "F"} or image.mode.startswith("I;16"):
-            return _scale_deep(np.asarray(image), name, deep=image.mode.startswith("I;16"))
-        return np.array(image if image.mode == "RGB" else image.convert("RGB"), np.uint8)
+        turned = orientation(image)
+        width, height = image.size
+        array = np.empty((width, height, 3) if turned in {5, 6, 7, 8} else (height, width, 3), np.uint8)
+        rows = _TURNS[turned](array) if turned in _TURNS else array
+        if image.mode in {"I", "F"}:
+            rows[:] = _scale_deep(np.asarray(image), name, deep=False)
+            return array
+        for top in range(0, height, _BAND):
+            band = image.crop((0, top, width, min(top + _BAND, height)))
+            if image.mode.startswith("I;16"):
+                rows[top : top + _BAND] = _scale_deep(np.asarray(band), name, deep=True)
+            else:
+                rows[top : top + _BAND] = np.asarray(band if band.mode == "RGB" else band.convert("RGB"))
+        return array
     except InputError:
         raise
     except _BROKEN as error:

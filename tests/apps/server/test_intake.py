@@ -98,6 +98,11 @@ def test_another_format_than_its_header_is_refused() -> None:
     assert caught.value.status == 422
 
 
+def test_webp_costs_more_memory_than_others() -> None:
+    costs = {kind: read_header(encode(picture(100, 20), kind)).cost for kind in ("JPEG", "PNG", "WEBP")}
+    assert costs == {"JPEG": 20_000, "PNG": 20_000, "WEBP": 34_000}
+
+
 def test_memory_is_given_back() -> None:
     budget = MemoryBudget(100)
     first, second = Reservation(budget), Reservation(budget)

@@ -117,7 +117,7 @@ def protocol_router(service: Service) -> APIRouter:
         async def work(deadline: float) -> Response:
             query = await service.in_pool(_parse, body, split, names, service.settings)
             count = len(query.images)
-            reservation.take(count * query.size[0] * query.size[1] * BYTES_PER_PIXEL)
+            reservation.take(sum(map(_cost, query.images)))
             with service.admit(count - 1) if count > 1 else nullcontext():
                 perceptions = await service.see_all(query.images, deadline, _perception)
                 return await service.in_pool(_answer, service.name, query, perceptions)
@@ -126,6 +126,10 @@ def protocol_router(service: Service) -> APIRouter:
             return await until_vanished(request, in_time(work(deadline), deadline))
 
     return router
+
+
+def _cost(image: Encoded | NDArray[np.uint8]) -> int:
+    return image.header.cost if isinstance(image, Encoded) else image.shape[0] * image.shape[1] * BYTES_PER_PIXEL
 
 
 def _perception(outcome: Outcome) -> Perception:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trilitenet.apps.server.problems import BusyError, ProblemError
-from trilitenet.apps.server.settings import Settings
+from trilitenet.apps.server.settings import BYTES_PER_PIXEL, WEBP_BYTES_PER_PIXEL, Settings
 from trilitenet.errors import InputError
 from trilitenet.processing.images import read_image
 
@@ -45,6 +45,12 @@ class Header(NamedTuple):
     width: int
     height: int
     scans: int
+
+    @property
+    def cost(self) -> int:
+        """Bytes of memory that the image may take while it is worked on."""
+        each = WEBP_BYTES_PER_PIXEL if self.kind == "WEBP" else BYTES_PER_PIXEL
+        return self.width * self.height * each
 
 
 def read_header(data: bytes) -> Header:

@@ -23,7 +23,6 @@ from trilitenet.apps.server.intake import Reservation, check_header, read_body, 
 from trilitenet.apps.server.multipart import split_form
 from trilitenet.apps.server.problems import BusyError, ProblemError
 from trilitenet.apps.server.service import Encoded, Outcome, Service
-from trilitenet.apps.server.settings import BYTES_PER_PIXEL
 from trilitenet.processing.drawing import DRIVABLE_COLOUR, LANE_COLOUR
 from trilitenet.structures import Perception
 
@@ -164,7 +163,7 @@ async def _all_images(request: Request, service: Service, reservation: Reservati
 def _checked(data: bytes, service: Service, reservation: Reservation) -> Encoded:
     header = read_header(data)
     check_header(header, service.settings)
-    reservation.take(header.width * header.height * BYTES_PER_PIXEL)
+    reservation.take(header.cost)
     return Encoded(data, header)
 
 

@@ -9,10 +9,13 @@ from typing import Final
 from trilitenet.errors import ConfigError
 from trilitenet.processing.cores import usable_cores
 
-__all__ = ["BYTES_PER_PIXEL", "Settings"]
+__all__ = ["BYTES_PER_PIXEL", "WEBP_BYTES_PER_PIXEL", "Settings"]
 
 BYTES_PER_PIXEL: Final = 10
 """Memory that one pixel of an accepted image may take while it is worked on: decoder, RGB copy, masks, drawing."""
+
+WEBP_BYTES_PER_PIXEL: Final = 17
+"""The same for WebP, whose decoder keeps several copies."""
 
 
 @dataclasses.dataclass(frozen=True)
