@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import trilitenet
@@ -172,6 +173,12 @@ def test_what_cannot_be_written_is_told_in_one_line(
     monkeypatch.setattr(command, "save_onnx", fill)
     with pytest.raises(OutputError, match=r"b\.onnx: cannot be written \(No space left on device\)$"):
         export(str(artefacts.folder / "weights.safetensors"), size="64x128", output=tmp_path / "b.onnx")
+    # PyTorch aborts the process where it cannot write: it never gets the file.
+    monkeypatch.setattr(torch.export, "export", lambda *_, **__: None)
+    monkeypatch.setattr(torch.export, "save", lambda _, file, **__: file.write(b"program"))
+    monkeypatch.setattr(Path, "write_bytes", fill)
+    with pytest.raises(OutputError, match=r"c\.pt2: cannot be written \(No space left on device\)$"):
+        export(str(artefacts.folder / "weights.safetensors"), format="torch", size="64x128", output=tmp_path / "c.pt2")
     assert [path.name for path in tmp_path.iterdir()] == ["a.onnx"]
 
 

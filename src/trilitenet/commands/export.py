@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import io
 import math
 import re
 import tempfile
@@ -538,7 +539,9 @@ def _export_torch(
         program = torch.export.export(Outputs().eval(), (image,), dynamic_shapes=dynamic)
     with _trial(path) as trial:
         metadata = {CARD_KEY: network.card.to_json(), ARTEFACT_KEY: info.to_json()}
-        torch.export.save(program, trial, extra_files=metadata)
+        data = io.BytesIO()  # PyTorch aborts the process where it cannot write to a file
+        torch.export.save(program, data, extra_files=metadata)
+        trial.write_bytes(data.getbuffer())
         parity = _compare(network, ExportedTorchBackend(trial, "cpu"), info, checks)
         _require(parity, path)
     return Exported(path, info, parity)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
-from trilitenet.errors import import_extra
+from trilitenet.errors import OutputError, import_extra
 
 __all__ = ["build_openvino", "has_amx", "save_openvino"]
 
@@ -33,11 +33,17 @@ def save_openvino(model: Any, path: str | os.PathLike[str], card: ModelCard, inf
         path: The ``.xml`` file.
         card: What the network is.
         info: How the artefact takes pixels and returns results; weights of an fp16 artefact are stored as fp16.
+
+    Raises:
+        OutputError: If they cannot be written.
     """
     openvino = import_extra("openvino", "openvino")
     model.set_rt_info(card.to_json(), CARD_KEY.split("."))
     model.set_rt_info(info.to_json(), ARTEFACT_KEY.split("."))
-    openvino.save_model(model, Path(path), compress_to_fp16=info.precision == "fp16")
+    try:
+        openvino.save_model(model, Path(path), compress_to_fp16=info.precision == "fp16")
+    except RuntimeError as error:  # "basic_ios::clear: iostream error" where the disk is full
+        raise OutputError(f"{path}: cannot be written ({' '.join(str(error).split())}); is there room?") from error
 
 
 def has_amx() -> bool:
