@@ -167,6 +167,16 @@ def test_a_broken_document_is_counted_and_the_rest_converted(tmp_path: Path, con
     assert report.dropped["train"]["image: labels or image broken"] == 1
 
 
+@pytest.mark.parametrize("key", ["crowd", "ignored"])
+def test_crowd_may_be_text(key: str) -> None:
+    box = {"x1": 1, "y1": 2, "x2": 3, "y2": 4}
+    values = (True, "true", False, "false", None)
+    labels = [{"category": "car", "box2d": box, "attributes": {key: value}} for value in values]
+    objects = parse_labels({"labels": labels}, Path("x.jpg"), "x.json").objects
+    assert objects is not None
+    assert [item.crowd for item in objects] == [True, True, False, False, False]
+
+
 @pytest.mark.parametrize("ascii_only", [False, True])
 def test_names_beyond_ascii_keep_their_labels(tmp_path: Path, ascii_only: bool) -> None:
     raw = tmp_path / "raw"

@@ -26,7 +26,7 @@ from typing import Any, Final
 
 from trilitenet.config import TASKS, Task
 from trilitenet.data.rasterise import flatten
-from trilitenet.data.reading import IMAGE_ENDINGS
+from trilitenet.data.reading import IMAGE_ENDINGS, is_crowd
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel, same_name
 from trilitenet.errors import DataError, brief
 
@@ -244,7 +244,7 @@ def _parse_item(
     if item.get("box2d") is not None:
         box = item["box2d"]
         corners = (float(box["x1"]), float(box["y1"]), float(box["x2"]), float(box["y2"]))
-        crowd = bool(attributes.get("crowd", False) or attributes.get("ignored", False))
+        crowd = is_crowd(item) or is_crowd({"attributes": {"crowd": attributes.get("ignored")}})
         kept = {str(k): v for k, v in attributes.items() if isinstance(v, (str, bool, int, float))}
         objects.append(ObjectLabel(category, corners, crowd, kept))
     elif item.get("poly2d"):
