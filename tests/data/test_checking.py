@@ -11,6 +11,7 @@ import pytest
 
 from tests.data.published import write_annotation, write_published
 from trilitenet.data.checking import KINDS, CheckReport, check_dataset, detect_layout
+from trilitenet.data.reading import DrivingDataset
 from trilitenet.errors import DataError
 
 pytest.importorskip("imagehash")
@@ -162,6 +163,13 @@ def test_every_planted_fault_is_found_and_nothing_else(root: Path, fault: str) -
     assert kinds(report) == {kind}
     assert report.findings[0].examples
     assert not report.ok
+
+
+def test_an_ego_mask_of_a_name_that_no_system_has(root: Path) -> None:
+    (root / "dataset.yaml").write_text('ego_mask: "\\uD800.png"\n')
+    assert kinds(check_dataset(root)) == {"ego-mask"}
+    with pytest.raises(DataError, match="cannot be read"):
+        DrivingDataset(root, "train")[0]
 
 
 def test_all_kinds_are_planted() -> None:

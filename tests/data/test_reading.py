@@ -175,6 +175,9 @@ def test_errors_name_the_file(root: Path) -> None:
     (root / "det_annotations/train/train_0004.json").write_text('{"frames": [{"objects": [{"box2d": {}}]}]}')
     with pytest.raises(DataError, match="train_0004: not an annotation"):
         dataset[4]
+    (root / "det_annotations/train/train_0005.json").write_text('{"frames": [], "attributes": ["night"]}')
+    with pytest.raises(DataError, match="train_0005: not an annotation"):
+        dataset.attributes(5)
     with pytest.raises(DataError, match="not an image"):
         decode_image(b"", "nothing")
 

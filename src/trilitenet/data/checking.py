@@ -32,6 +32,7 @@ from trilitenet.data.reading import (
     IMAGE_ENDINGS,
     IMAGE_FOLDER,
     LANE_FOLDER,
+    decode_mask,
     is_crowd,
     read_index,
 )
@@ -267,7 +268,7 @@ def check_dataset(
     _find_near_duplicates(facts, collector)
     _find_sequences(index, facts, collector)
     for name in filter(None, {description.ego_mask, *description.ego_masks.values()}):
-        if cv2.imread(str(root / name), cv2.IMREAD_UNCHANGED) is None:
+        if not _is_mask(root / name):
             collector.add("ego-mask", "", name)
     for split in description.splits:
         if not names.get(split):
@@ -293,6 +294,15 @@ def check_dataset(
         box_sizes=tuple((float(w), float(h)) for w, h in box_sizes[chosen]),
         findings=collector.findings(),
     )
+
+
+def _is_mask(path: Path) -> bool:
+    """Return whether a file can be read as a mask; OpenCV itself crashes on a path that is not UTF-8."""
+    try:
+        decode_mask(path.read_bytes(), "", MaskMeaning())
+    except (OSError, ValueError):  # of broken files, too, and of paths that no system has
+        return False
+    return True
 
 
 class _Collector:

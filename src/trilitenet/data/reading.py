@@ -236,8 +236,10 @@ class DrivingDataset:
         """Return the attributes of an image without decoding it."""
         name = self.names[index]
         content = self._annotation(name)
-        own = content.get("attributes") if isinstance(content, dict) else None
-        return {str(key): str(value) for key, value in (own or {}).items()} | self._extra.get(name, {})
+        own = (content.get("attributes") if isinstance(content, dict) else None) or {}
+        if not isinstance(own, dict):
+            raise DataError(f"{name}: not an annotation in the per-image form (attributes are no object)")
+        return {str(key): str(value) for key, value in own.items()} | self._extra.get(name, {})
 
     def fingerprint(self, index: int) -> str:
         """Return a hash of a sample's files and of what their values mean; files that are missing are left out."""
@@ -491,7 +493,7 @@ def _ego_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
     """Return where an image of ``size`` is valid, from a mask of the own car of any size."""
     try:
         data = np.fromfile(path, np.uint8)
-    except OSError as error:
+    except (OSError, ValueError) as error:  # the latter of a path that no system has
         raise DataError(f"{path}: the ego mask that dataset.yaml names cannot be read") from error
     own, _ = decode_mask(data, str(path), MaskMeaning(above=0))
     if own.shape != size:
