@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
@@ -107,10 +108,19 @@ def _collate(samples: list[Sample | TriLiteNetError]) -> Batch | TriLiteNetError
 
 
 def _batches(loader: Iterable[Batch | TriLiteNetError]) -> Iterator[Batch]:
-    for batch in loader:
-        if isinstance(batch, TriLiteNetError):
-            raise batch
-        yield batch
+    """Yield the batches.
+
+    Raises:
+        RuntimeError: If a worker was killed; its text begins with ``DataLoader worker``.
+    """
+    try:
+        for batch in loader:
+            if isinstance(batch, TriLiteNetError):
+                raise batch
+            yield batch
+    except (EOFError, OSError) as error:  # it was killed while it handed a batch over
+        time.sleep(1.0)  # PyTorch raises which one as soon as the system tells of its end
+        raise RuntimeError(f"DataLoader worker lost ({error})") from error
 
 
 class _Plan(torch.utils.data.Sampler[list[_Draw]]):
