@@ -2,9 +2,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.sample import Sample
@@ -156,6 +158,19 @@ def test_writing_refuses_to_mix_with_what_is_there(tmp_path: Path) -> None:
     write_dataset(tmp_path, "train", count=1, seed=2, size=SIZE)
     with pytest.raises(ConfigError, match="at least 1"):
         write_dataset(tmp_path, "more", count=0)
+
+
+def test_an_image_that_is_there_has_its_labels_when_the_disk_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def save(self: Image.Image, path: Path, **more: Any) -> None:
+        path.write_bytes(b"cut off")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", save)
+    with pytest.raises(OutputError, match="No space left"):
+        write_dataset(tmp_path, "train", count=1, seed=0, size=SIZE)
+    assert {path.suffix for path in tmp_path.rglob("*") if path.is_file()} == {".json", ".yaml"}
 
 
 def test_uncertain_vehicles_are_written_as_crowd() -> None:

@@ -223,16 +223,33 @@ def test_no_frames_is_an_error(tmp_path: Path) -> None:
         list(Empty("empty"))
 
 
-def test_standard_input() -> None:
+def read_piped(data: bytes) -> subprocess.CompletedProcess[bytes]:
     script = (
         "from trilitenet.inference.sources import VideoReader\n"
         "print([(f.index, f.source, f.image.shape) for f in VideoReader('-')])"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script], input=transport_stream(0, 3), capture_output=True, timeout=60, check=False
-    )
+    return subprocess.run([sys.executable, "-c", script], input=data, capture_output=True, timeout=60, check=False)
+
+
+def test_standard_input() -> None:
+    done = read_piped(transport_stream(0, 3))
     assert done.returncode == 0, done.stderr.decode()
     assert done.stdout.decode().strip() == str([(i, "stdin", (96, 160, 3)) for i in range(3)])
+
+
+def test_a_piped_mp4_with_its_index_at_the_end_is_told_with_the_cure() -> None:
+    buffer = io.BytesIO()
+    with av.open(buffer, "w", format="mp4") as container:
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 320, 192, "yuv420p"
+        stream.bit_rate = 20_000_000
+        noise = np.random.default_rng(0)
+        for _ in range(20):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(noise.integers(0, 256, (192, 320, 3), np.uint8))))
+        container.mux(stream.encode(None))
+    message = read_piped(buffer.getvalue()).stderr.decode().splitlines()[-1]
+    assert "InputError: stdin: " in message
+    assert "+faststart" in message
 
 
 class Server:

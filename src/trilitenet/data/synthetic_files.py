@@ -15,7 +15,7 @@ from PIL import Image
 from trilitenet.data.description import DESCRIPTION_FILE, DatasetDescription, write_description
 from trilitenet.data.sample import Sample
 from trilitenet.data.synthetic import SyntheticScenes
-from trilitenet.errors import ConfigError, OutputError
+from trilitenet.errors import ConfigError, OutputError, replacing
 from trilitenet.processing.cores import ProcessPool
 
 __all__ = ["annotation", "write_dataset", "write_sample"]
@@ -101,14 +101,19 @@ def _write_scene(
 
 
 def write_sample(root: Path, split: str, sample: Sample) -> None:
-    """Write one sample; a task that is not labelled has no file."""
-    Image.fromarray(sample.image).save(root / "images" / split / f"{sample.name}.jpg", quality=92)
+    """Write one sample; a task that is not labelled has no file.
+
+    The image comes last: should the writing end, by a full disk for example, each image that is there has its labels.
+    """
     if sample.boxes is not None:
-        text = json.dumps(annotation(sample), separators=(",", ":"))
-        (root / "det_annotations" / split / f"{sample.name}.json").write_text(text, encoding="utf-8")
+        with replacing(root / "det_annotations" / split / f"{sample.name}.json") as part:
+            part.write_text(json.dumps(annotation(sample), separators=(",", ":")), encoding="utf-8")
     for folder, mask in (("da_seg_annotations", sample.drivable), ("ll_seg_annotations", sample.lane)):
         if mask is not None:
-            Image.fromarray(_visible(mask)).save(root / folder / split / f"{sample.name}.png")
+            with replacing(root / folder / split / f"{sample.name}.png") as part:
+                Image.fromarray(_visible(mask)).save(part, format="PNG")
+    with replacing(root / "images" / split / f"{sample.name}.jpg") as part:
+        Image.fromarray(sample.image).save(part, format="JPEG", quality=92)
 
 
 def _visible(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -148,6 +148,7 @@ class FrameReader(abc.ABC):
     """
 
     live = False
+    _cure = ""
 
     def __init__(self, name: str, clip: Clip | None = None) -> None:
         self.name = name
@@ -180,7 +181,7 @@ class FrameReader(abc.ABC):
                     break
         if not given:
             part = "" if self.clip.start == 0 and self.clip.end is None else " between --start and --end"
-            raise InputError(f"{self.name}: has no frames that can be decoded{part}")
+            raise InputError(f"{self.name}: has no frames that can be decoded{part}{self._cure}")
 
     def _index(self, timestamp: float, count: int) -> int:
         """Return the position in the video of a frame before which so many came, broken ones included."""
@@ -212,7 +213,9 @@ class VideoReader(FrameReader):
         self._path = str(path)
         self._constant = False
         self._skipped = 0
-        if self._path != "-":
+        if self._path == "-":
+            self._cure = "; an MP4 can be piped if its index comes first: ffmpeg -i IN -c copy -movflags +faststart OUT"
+        else:
             with _open_container(self._path, self.name) as container:
                 stream = container.streams.video[0]
                 rate = stream.average_rate or stream.guessed_rate
