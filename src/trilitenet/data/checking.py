@@ -38,7 +38,7 @@ from trilitenet.data.reading import (
 )
 from trilitenet.errors import DataError, import_extra
 from trilitenet.processing.cores import ProcessPool
-from trilitenet.processing.images import orientation
+from trilitenet.processing.images import upright_size
 
 __all__ = ["KINDS", "CheckReport", "Finding", "check_dataset", "detect_layout"]
 
@@ -376,9 +376,7 @@ def _look_at_image(
     digest = hashlib.blake2b(data, digest_size=12).digest()
     try:
         with Image.open(io.BytesIO(data)) as image:
-            width, height = image.size
-            if orientation(image) in {5, 6, 7, 8}:
-                width, height = height, width
+            size = upright_size(image)
             # JPEGs are decoded at 1/2, 1/4 or 1/8: a whole file is read, in a part of the time.
             image.draft("L", (64, 64))
             grey = image.convert("L").resize((64, 64), Image.Resampling.BILINEAR)
@@ -386,7 +384,7 @@ def _look_at_image(
         faults.append(("image-unreadable", f"{where} ({_reason(error)})"))
         return None, digest, 0, b""
     bits = _perceptual_hash(grey)
-    return (height, width), digest, bits, grey.resize((16, 16), Image.Resampling.BOX).tobytes()
+    return size, digest, bits, grey.resize((16, 16), Image.Resampling.BOX).tobytes()
 
 
 def _perceptual_hash(grey: Image.Image) -> int:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trilitenet.errors import DataError, ShapeError
-from trilitenet.processing.images import orientation
+from trilitenet.processing.images import upright_size
 from trilitenet.processing.serialise import decode_mask
 
 __all__ = [
@@ -210,12 +210,9 @@ def image_size(path: Path) -> tuple[int, int]:
     """
     try:
         with Image.open(path) as image:
-            width, height = image.size
-            if orientation(image) in {5, 6, 7, 8}:
-                width, height = height, width
+            return upright_size(image)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise DataError(f"{path}: not an image that can be read ({error})") from error
-    return height, width
 
 
 def same_name(name: str, split: str, one: Path, two: Path) -> DataError:

@@ -15,7 +15,7 @@ from PIL import ExifTags, Image
 
 from trilitenet.errors import InputError, ShapeError
 
-__all__ = ["IMAGE_SUFFIXES", "orientation", "read_image", "to_rgb"]
+__all__ = ["IMAGE_SUFFIXES", "read_image", "to_rgb", "upright_size"]
 
 IMAGE_SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm"})
 """File name endings, in lower case, that are taken for images in folders."""
@@ -33,6 +33,9 @@ _TURNS: Final[dict[int, Callable[[NDArray[np.uint8]], NDArray[np.uint8]]]] = {
     8: lambda upright: np.rot90(upright, -1),
 }
 """The rows and columns of a file as a view of the upright picture, by the file's orientation in EXIF."""
+
+_SIDEWAYS: Final = frozenset({5, 6, 7, 8})
+"""Orientations that exchange width and height."""
 
 _BAND: Final = 64
 """Rows that are converted at once: as a whole, each step would hold a copy of the picture, and wait for memory."""
@@ -114,9 +117,9 @@ def to_rgb(array: NDArray[Any]) -> NDArray[np.uint8]:
 def _decode(image: Image.Image, name: str) -> NDArray[np.uint8]:
     try:
         image.load()
-        turned = orientation(image)
+        turned = _orientation(image)
         width, height = image.size
-        array = np.empty((width, height, 3) if turned in {5, 6, 7, 8} else (height, width, 3), np.uint8)
+        array = np.empty((width, height, 3) if turned in _SIDEWAYS else (height, width, 3), np.uint8)
         rows = _TURNS[turned](array) if turned in _TURNS else array
         if image.mode in {"I", "F"}:
             rows[:] = _scale_deep(np.asarray(image), name, deep=False)
@@ -134,7 +137,13 @@ def _decode(image: Image.Image, name: str) -> NDArray[np.uint8]:
         raise InputError(f"{name}: is broken or truncated ({_reason(error)})") from error
 
 
-def orientation(image: Image.Image) -> Any:
+def upright_size(image: Image.Image) -> tuple[int, int]:
+    """Return the (height, width) px that `read_image` gives, turned as EXIF notes, without decoding the picture."""
+    width, height = image.size
+    return (width, height) if _orientation(image) in _SIDEWAYS else (height, width)
+
+
+def _orientation(image: Image.Image) -> Any:
     """Return the orientation that EXIF notes; 1, upright, if EXIF cannot be read: the pixels may be whole."""
     try:
         with warnings.catch_warnings():
