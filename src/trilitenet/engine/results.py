@@ -94,5 +94,5 @@ def _plot(path: Path, curves: Mapping[str, tuple[list[int], list[float]]], *, lo
         axes.set_ylim(bottom=max(axes.get_ylim()[0], highest / 1e4))  # a term next to nothing flattens no other
     axes.set_xlabel("step")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, loc="upper right" if log else "lower right")  # losses fall, figures rise
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))  # beside the curves, over none of them
     figure.savefig(path, dpi=100)
