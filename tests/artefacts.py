@@ -43,7 +43,7 @@ def make_artefacts(folder: Path) -> Artefacts:
     network.card = card
     save_network(network, folder / "weights.safetensors", card)
     info = ArtefactInfo("onnx", size=SIZE, trilitenet="0")
-    model = build_onnx(DeployGraph(network, LAYOUTS["heads"]), card, info)
+    model = build_onnx(DeployGraph(network, LAYOUTS["vectors-tiny"]), card, info)
     save_onnx(model, folder / "model.onnx")
     info = dataclasses.replace(info, format="openvino", precision="bf16")
     save_openvino(build_openvino(model), folder / "model.xml", card, info)

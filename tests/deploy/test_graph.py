@@ -64,7 +64,7 @@ def test_variants_and_layouts(variant: str, layout: str) -> None:
 
 
 @pytest.mark.parametrize("size", [(384, 640), (256, 448), (640, 640)])
-@pytest.mark.parametrize("layout", ["wide", "pixels", "planar-maximum-heads"])
+@pytest.mark.parametrize("layout", ["tiles-tiny", "vectors-small", "pixels", "planar-maximum-heads"])
 def test_sizes(size: tuple[int, int], layout: str) -> None:
     check(lively_network(), size, layout=LAYOUTS[layout])
 
@@ -104,7 +104,7 @@ def test_anchors_are_those_of_the_network() -> None:
     check(lively_network(anchors=anchors))
 
 
-@pytest.mark.parametrize("layout", ["heads-split", "planar", "planar-maximum-split"])
+@pytest.mark.parametrize("layout", ["tiles-tiny", "vectors-base", "pixels", "planar", "planar-maximum-heads"])
 def test_bgr_and_doubled_masks(layout: str) -> None:
     network = lively_network()
     images = torch.randint(0, 256, (1, 64, 128, 3), dtype=torch.uint8)

@@ -77,7 +77,7 @@ def test_dynamic_sizes_and_half_weights(tmp_path: Path) -> None:
 
     network = lively_network()
     info = ArtefactInfo("onnx", "fp16", None)
-    model = build_onnx(DeployGraph(network, LAYOUTS["heads"]), network.card, info, half=True)
+    model = build_onnx(DeployGraph(network, LAYOUTS["vectors-tiny"]), network.card, info, half=True)
     save_onnx(model, tmp_path / "a.onnx")
     backend = OnnxBackend(tmp_path / "a.onnx")
     assert backend.canvas is None
@@ -97,13 +97,13 @@ def test_what_cannot_be_traced_is_one_plain_line(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(torch.onnx, "export", fail)
     network = lively_network()
     with pytest.raises(BackendError, match=r"\(Expected shape\[1\] = 360 to be of the form 32\*rows\)$"):
-        build_onnx(DeployGraph(network, LAYOUTS["heads"]), network.card, ArtefactInfo("onnx"))
+        build_onnx(DeployGraph(network, LAYOUTS["vectors-tiny"]), network.card, ArtefactInfo("onnx"))
 
 
 def test_layouts_are_picked() -> None:
-    assert pick_layout("auto", "tiny", "openvino", amx=True).front == 2
-    assert pick_layout("auto", "base", "openvino", amx=True).front == 1
-    assert pick_layout("auto", "base", "openvino", amx=False).half == 1
+    assert pick_layout("auto", "tiny", "openvino", amx=True) == LAYOUTS["tiles-tiny"]
+    assert pick_layout("auto", "base", "openvino", amx=False) == LAYOUTS["vectors-base"]
+    assert pick_layout("auto", "base", "cuda", amx=True) == LAYOUTS["pixels"]
     assert not pick_layout("auto", "tiny", "onnxruntime", amx=True).channels_last
     with pytest.raises(ConfigError, match="did you mean 'pixels'"):
         pick_layout("pixel", "tiny", "openvino", amx=False)

@@ -1,12 +1,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from trilitenet.config import ArtefactInfo, ModelCard
-from trilitenet.deploy.openvino import save_openvino
+from tests.deploy.networks import lively_network
+from trilitenet.config import ArtefactInfo, ModelCard, Thresholds
+from trilitenet.deploy.graph import DeployGraph
+from trilitenet.deploy.layouts import LAYOUTS, pick_layout
+from trilitenet.deploy.onnx import build_onnx
+from trilitenet.deploy.openvino import build_openvino, has_amx, save_openvino, with_own_biases
 from trilitenet.errors import OutputError
 
 openvino = pytest.importorskip("openvino")
@@ -18,3 +23,37 @@ def test_what_cannot_be_written_is_told_in_one_line(tmp_path: Path) -> None:
     model = openvino.Model([openvino.opset13.relu(image)], [image], "a")
     with pytest.raises(OutputError, match=r"a\.xml: cannot be written .*is there room\?$"):
         save_openvino(model, tmp_path / "a.xml", ModelCard("tiny"), ArtefactInfo("openvino"))
+
+
+@pytest.mark.parametrize("variant", ["tiny", "small", "base"])
+def test_cells_of_columns_are_views(variant: str) -> None:
+    """Outside the attention, which regroups bins, nothing is copied to be laid out anew."""
+    pytest.importorskip("onnx")
+    if not has_amx():
+        pytest.skip("layouts of processors with matrix tiles")
+    network = lively_network(variant)
+    graph = DeployGraph(network, pick_layout("auto", variant, "openvino", amx=True))
+    info = ArtefactInfo("openvino", "bf16", (384, 640))
+    model = build_openvino(build_onnx(graph, network.card, info))
+    compiled = openvino.Core().compile_model(model, "CPU", {"INFERENCE_PRECISION_HINT": "bf16"})
+    copying = [
+        node.get_friendly_name()
+        for node in compiled.get_runtime_model().get_ordered_ops()
+        if node.get_rt_info()["layerType"].astype(str) in ("Transpose", "DepthToSpace")
+    ]
+    assert not [name for name in copying if not name.startswith("pcaa/")]
+
+
+def test_convolutions_that_share_a_bias_get_their_own() -> None:
+    pytest.importorskip("onnx")
+    network = lively_network(tasks=("lane",))
+    graph = DeployGraph(network, LAYOUTS["tiles-tiny"], thresholds=Thresholds(lane=0.4))
+    shared = build_onnx(graph, network.card, ArtefactInfo("openvino", "bf16", (64, 128)))
+
+    def biases(model: Any) -> list[str]:
+        return [node.input[2] for node in model.graph.node if node.op_type == "Conv" and len(node.input) > 2]
+
+    own = with_own_biases(shared)
+    assert len(set(biases(shared))) < len(biases(shared)) == len(set(biases(own)))
+    values = [{entry.name: entry.raw_data for entry in model.graph.initializer} for model in (shared, own)]
+    assert [values[0][name] for name in biases(shared)] == [values[1][name] for name in biases(own)]

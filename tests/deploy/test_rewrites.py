@@ -148,7 +148,7 @@ def test_nest_blocks_orders_a_doubled_map() -> None:
     block = lively(TransposedConvBNPReLU(6, 3))
     assert isinstance(block, TransposedConvBNPReLU)
     kernel = rewrites.transposed_as_pointwise(block.deconv.weight, block.bn)
-    kernel = rewrites.nest_blocks(rewrites.space_to_depth_kernel(kernel, (2, 2), (2, 2)), 2)
+    kernel = rewrites.nest_blocks(rewrites.space_to_depth_kernel(kernel, (2, 2), (2, 2)), (2, 2))
     x = image(6, 4, 6)
     wanted = space_to_depth(block.bn(block.deconv(x)), (4, 4))
     assert_same(apply(kernel, space_to_depth(x, (2, 2))), wanted)
@@ -175,6 +175,37 @@ def test_space_to_depth_kernel(stride: int, source: tuple[int, int], target: tup
     x = image(3)
     kernel = rewrites.space_to_depth_kernel(rewrites.conv_kernel(conv), source, target)
     assert_same(apply(kernel, space_to_depth(x, source)), space_to_depth(conv(x), target))
+
+
+@pytest.mark.parametrize("dilation", [1, 2, 4, 8])
+@pytest.mark.parametrize("depthwise", [True, False])
+@pytest.mark.parametrize("columns", [2, 4])
+def test_dilated_convolutions_in_cells_of_columns(columns: int, depthwise: bool, dilation: int) -> None:
+    groups = 3 if depthwise else 1
+    conv = nn.Conv2d(3, 3, 3, padding=dilation, dilation=dilation, groups=groups).double()
+    x = image(3)
+    kernel = rewrites.space_to_depth_kernel(rewrites.conv_kernel(conv), (1, columns), (1, columns))
+    assert_same(apply(kernel, space_to_depth(x, (1, columns))), space_to_depth(conv(x), (1, columns)))
+    divides = dilation % columns == 0
+    assert kernel.groups == (3 * columns if depthwise and divides else 1)
+    assert kernel.dilation == (dilation, dilation // columns if divides else 1)
+
+
+def test_concatenated_cells_take_the_parts_cells() -> None:
+    conv = nn.Conv2d(7, 5, 3, padding=1).double()
+    x, y = image(4), image(3)
+    kernel = rewrites.concatenated_cells(rewrites.conv_kernel(conv), (4, 3), (1, 4))
+    cells = torch.cat([space_to_depth(part, (1, 4)) for part in (x, y)], 1)
+    assert_same(apply(kernel, cells), space_to_depth(conv(torch.cat((x, y), 1)), (1, 4)))
+
+
+@pytest.mark.parametrize("columns", [1, 2])
+def test_transposed_convolution_in_cells_of_columns(columns: int) -> None:
+    conv = nn.ConvTranspose2d(6, 3, 2, 2, bias=False).double()
+    x = image(6, 4, 8)
+    weight = rewrites.transposed_in_columns(conv.weight.detach(), columns)
+    cells = F.conv_transpose2d(space_to_depth(x, (1, columns)), weight, None, (2, 1))
+    assert_same(cells, space_to_depth(conv(x), (1, 2 * columns)))
 
 
 @pytest.mark.parametrize("threshold", [0.2, 0.5, 0.9])

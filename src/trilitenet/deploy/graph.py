@@ -2,7 +2,7 @@
 
 Pixels go in as they are, uint8 and channels-last; boxes come out decoded and masks decided. Everything between is the
 network after the exact rewrites of `trilitenet.deploy.rewrites`: no batch normalisation, no pooling of the image, no
-sums inside ESP blocks, no transposed convolution (where the layout is channels-last).
+sums inside ESP blocks, no transposed convolution at the end (where the layout is channels-last).
 """
 
 from __future__ import annotations
@@ -22,9 +22,11 @@ from trilitenet.deploy.layers import (
     Layout,
     SeparableGraph,
     StrideESPGraph,
+    concatenate,
     constant,
     depth_to_space,
     fold_block,
+    recolumn,
 )
 from trilitenet.deploy.rewrites import (
     compose_pointwise,
@@ -40,6 +42,7 @@ from trilitenet.deploy.rewrites import (
     reverse_inputs,
     space_to_depth_kernel,
     split_inputs,
+    take_outputs,
     transposed_as_pointwise,
     upsample_kernel,
 )
@@ -199,13 +202,15 @@ class DetectionGraph(nn.Module):
     def decode(self, level: int, logits: Tensor) -> Tensor:
         """Decode one level: (B, anchors x values, h, w) -> (B, h x w x anchors, values)."""
         batch, _, height, width = logits.shape
-        logits = logits.permute(0, 2, 3, 1)
+        # Rows of all values of all columns, so that a processor's vectors are filled.
+        logits = logits.permute(0, 2, 3, 1).reshape(batch, height, -1)
         # Sides and centres of boxes do not survive the ten bits of half precision.
         scores = torch.sigmoid(logits.float() if logits.dtype in REDUCED else logits)
         columns = torch.arange(width, dtype=torch.float32, device=logits.device) - 0.5
         rows = torch.arange(height, dtype=torch.float32, device=logits.device) - 0.5
-        offset = columns.view(1, width, 1) * self.step[0, level] + rows.view(height, 1, 1) * self.step[1, level]
-        decoded = (scores * self.square[level] + self.linear[level]) * scores + offset
+        offset = (columns.view(width, 1) * self.step[0, level]).view(1, -1)
+        offset = offset + rows.view(height, 1) * self.step[1, level].repeat(width)
+        decoded = (scores * self.square[level].repeat(width) + self.linear[level].repeat(width)) * scores + offset
         return decoded.reshape(batch, -1, self.values)
 
 
@@ -215,26 +220,24 @@ class UpStageGraph(nn.Module):
     Args:
         stage: The network's.
         layout: How to lay it out.
-        source: Side of the pixel blocks of its input.
-        block: Side of the pixel blocks of the image and of its output, at most twice ``source``.
+        columns: Columns that share a cell of its output and of the image, and half of those of its input; 1 for none.
+        block: Side of the pixel blocks of the image and of its output; the input has none.
         before: Channels a pixel in front of those of the image, which are left alone; only where ``layout`` splits.
     """
 
-    def __init__(self, stage: UpStage, layout: Layout, source: int, block: int, before: int = 0) -> None:
+    def __init__(self, stage: UpStage, layout: Layout, columns: int, block: int = 1, before: int = 0) -> None:
         super().__init__()
+        maximum = layout.maximum
         slopes = prelu_slopes(stage.up.act, stage.up.deconv.out_channels)
+        self.unblock = 1
         self.up: FusedConv | FusedTransposedConv
-        if layout.channels_last or block > 1:
+        if layout.pointwise or block > 1:
             kernel = transposed_as_pointwise(stage.up.deconv.weight, stage.up.bn)
-            kernel = space_to_depth_kernel(kernel, (source, source), (source, source))
-            self.unblock = 2 * source // block
-            if self.unblock != source:  # else what the blocks of the input become is what is taken apart
-                kernel = nest_blocks(kernel, source)
-            self.up = FusedConv(kernel, slopes.repeat(4 * source * source), maximum=layout.maximum)
+            self.up = FusedConv(kernel, slopes.repeat(4), maximum=maximum)
+            self.unblock = 2 // block
         else:
-            self.up = FusedTransposedConv(stage.up.deconv, stage.up.bn, slopes, maximum=layout.maximum)
-            self.unblock = 1
-        blocks = (block, block)
+            self.up = FusedTransposedConv(stage.up.deconv, stage.up.bn, slopes, columns // 2, maximum=maximum)
+        cells, blocks = (columns, columns), (block, block)
         kernel, slopes = fold_block(stage.conv1)
         slopes = slopes.repeat(block * block)
         x, image = split_inputs(kernel, len(kernel.weight), 3)
@@ -242,16 +245,16 @@ class UpStageGraph(nn.Module):
         x, image = (space_to_depth_kernel(part, blocks, blocks) for part in (x, image))
         self.image = None
         if layout.split:
-            self.image = FusedConv(image)
+            self.image = FusedConv(image, columns=cells)
         else:
             x = x._replace(weight=torch.cat((x.weight, image.weight), 1))
-        self.conv1 = FusedConv(x, slopes, maximum=layout.maximum)
+        self.conv1 = FusedConv(x, slopes, cells, maximum=maximum)
         kernel, slopes = fold_block(stage.conv2)
         kernel = space_to_depth_kernel(kernel, blocks, blocks)
-        self.conv2 = FusedConv(kernel, slopes.repeat(block * block), maximum=layout.maximum)
+        self.conv2 = FusedConv(kernel, slopes.repeat(block * block), cells, maximum=maximum)
 
     def forward(self, x: Tensor, image: Tensor) -> Tensor:
-        """Map (B, C, H, W) and the image at twice the size to a map of that size; all in blocks."""
+        """Map (B, C, H, W) and the image at twice the size to a map of that size; all in cells or blocks."""
         x = self.up(x)
         if self.unblock > 1:
             x = depth_to_space(x, self.unblock)
@@ -269,7 +272,7 @@ class MaskGraph(nn.Module):
         masks: What the mask holds.
         scale: Mask pixels an input pixel, along an axis: 1 or 2.
         threshold: Probability above which a pixel is foreground.
-        before: Channels a pixel in front of those of the pooled image, which are left alone.
+        before: Channels a pixel in front of those of the pooled image at 1/2, which are left alone.
     """
 
     def __init__(
@@ -283,52 +286,77 @@ class MaskGraph(nn.Module):
     ) -> None:
         super().__init__()
         self.masks = masks
+        self.scale = scale
         self.channels_last = layout.channels_last
-        self.up1 = UpStageGraph(head.up1, layout, 1, layout.quarter)
-        self.up2 = UpStageGraph(head.up2, layout, layout.quarter, layout.half, before)
+        self.columns = layout.columns
+        self.up1 = UpStageGraph(head.up1, layout, self.columns.quarter)
+        self.up2 = UpStageGraph(head.up2, layout, self.columns.half, layout.half, before)
         slopes = prelu_slopes(head.out.act, 2)
         threshold = 0.5 if masks == "probability" else threshold
         self.out: FusedConv | FusedTransposedConv
-        self.difference: FusedConv | None = None
-        self.enlarge: FusedConv | None = None
-        self.scale = scale
-        half = layout.half
-        if layout.channels_last or half > 1:
-            kernel = transposed_as_pointwise(head.out.deconv.weight, head.out.bn)
-            kernel = space_to_depth_kernel(kernel, (half, half), (half, half))
-            self.out = FusedConv(nest_blocks(kernel, half), slopes.repeat(4 * half * half), maximum=layout.maximum)
-            self.block = 2 * half
-            self.difference = FusedConv(mask_difference(self.block**2, threshold))
-            if scale == 2:
-                blocks = (self.block, self.block)
-                kernel = space_to_depth_kernel(upsample_kernel(), blocks, blocks)
-                self.enlarge = FusedConv(nest_blocks(kernel, self.block))
-                self.block *= 2
-        else:
+        self.difference, self.enlarge = nn.ModuleList(), nn.ModuleList()
+        if not layout.channels_last and layout.half == 1:
             self.out = FusedTransposedConv(head.out.deconv, head.out.bn, slopes, maximum=layout.maximum)
-            self.block = 1
             self.offset = float(mask_difference(1, threshold).bias)
+            return
+        blocks = (layout.half, layout.half * self.columns.out)  # of pixels a cell, doubled by each step
+        kernel = transposed_as_pointwise(head.out.deconv.weight, head.out.bn)
+        kernel = nest_blocks(space_to_depth_kernel(kernel, blocks, blocks), blocks)
+        self.out = FusedConv(kernel, slopes.repeat(4 * blocks[0] * blocks[1]), maximum=layout.maximum)
+        blocks = (2 * blocks[0], 2 * blocks[1])
+        kernel = mask_difference(blocks[0] * blocks[1], threshold)
+        last = self.difference
+        if scale == 2:
+            self.difference.append(FusedConv(kernel))
+            kernel = nest_blocks(space_to_depth_kernel(upsample_kernel(), blocks, blocks), blocks)
+            blocks = (2 * blocks[0], 2 * blocks[1])
+            last = self.enlarge
+        self.blocks = blocks
+        # In cells of columns each row of a block comes from a convolution of its own.
+        outputs = torch.arange(len(kernel.weight)).view(blocks[0] if self.columns.out > 1 else 1, -1)
+        last.extend(FusedConv(take_outputs(kernel, row)) for row in outputs)
 
     def forward(self, x: Tensor, i1: Tensor, i2: Tensor) -> Tensor:
         """Return the mask, (B, scale x H, scale x W) for an input of H x W pixels."""
-        x = self.out(self.up2(self.up1(x, i2), i1))
-        if self.difference is not None:
-            x = self.difference(x)
-            x = x if self.enlarge is None else self.enlarge(x)
-            x = x if self.channels_last else depth_to_space(x, self.block)
-        else:
+        columns = self.columns
+        x = recolumn(self.up1(x, i2), columns.quarter, max(columns.half // 2, 1))
+        x = recolumn(self.up2(x, i1), columns.half, columns.out)
+        if not self.difference:
+            x = self.out(x)
             x = x[:, 1:] - x[:, :1] + self.offset
             if self.scale == 2:
                 x = F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
-        if self.masks == "decision":
-            x = (x > 0).to(torch.uint8)
-        elif self.masks == "probability":
-            x = (torch.sigmoid(x) * 255).round().to(torch.uint8)
+            return self.decide(x).squeeze(1)
+        x = self.out(x)
+        if self.enlarge:
+            x = self.difference[0](x)
+        parts = [conv(x) for conv in self.enlarge or self.difference]
         batch, _, height, width = x.shape
+        block_rows, block_columns = self.blocks
         if not self.channels_last:
-            return x.reshape(batch, height, width)
-        x = x.permute(0, 2, 3, 1).reshape(batch, height, width, self.block, self.block).permute(0, 1, 3, 2, 4)
-        return x.reshape(batch, height * self.block, width * self.block)
+            return self.decide(depth_to_space(parts[0], block_rows)).squeeze(1)
+        if len(parts) > 1:
+            lines = [self.decide(part).permute(0, 2, 3, 1).reshape(batch, height, -1) for part in parts]
+            x = torch.cat(lines, 2)
+        else:
+            x = self.decide(parts[0]).permute(0, 2, 3, 1).reshape(batch, height, width, *self.blocks)
+            x = x.permute(0, 1, 3, 2, 4)
+        return x.reshape(batch, height * block_rows, width * block_columns)
+
+    def decide(self, x: Tensor) -> Tensor:
+        """Turn differences of logits into what the mask holds."""
+        if self.masks == "decision" and self.columns.out > 1:  # the same decision, whose clamp OpenVINO fuses
+            return x.clamp(0, 1).ceil().to(torch.uint8)
+        if self.masks == "decision":
+            return (x > 0).to(torch.uint8)
+        if self.masks == "probability":
+            return (torch.sigmoid(x) * 255).round().to(torch.uint8)
+        return x
+
+
+def _halved(columns: int) -> int:
+    """Return how many columns share a cell before a convolution of stride 2 whose output has ``columns``."""
+    return 2 * columns if columns > 1 else 1
 
 
 class DeployGraph(nn.Module):
@@ -368,50 +396,52 @@ class DeployGraph(nn.Module):
         self.layout = layout = layout or Layout()
         encoder = network.encoder
         maximum = layout.maximum
-        front = (layout.front, layout.front)
-        # Channels-last, neighbours in a row share a cell: a mere view of the pixels, and the stem has 6 or 12 inputs.
-        self.block = 2 * layout.front if layout.channels_last else 1
-        source = (1, self.block)
+        columns = layout.columns
+        # Channels-last, two neighbours in a row share a cell of the pixels, a mere view: the stem has 6 inputs or more.
+        pair = 2 if layout.channels_last else 1
 
         scale, shift = fold_normalisation(network.card.mean, network.card.std)
-        self.scale = constant((scale.flip(0) if bgr else scale).repeat(self.block))
-        self.shift = constant((shift.flip(0) if bgr else shift).repeat(self.block))
+        self.scale = constant(scale.flip(0) if bgr else scale)
+        self.shift = constant(shift.flip(0) if bgr else shift)
 
         kernel, slopes = fold_block(encoder.level1)
         wide = len(slopes)
         kernel, slopes = merge_pool_into_stem(kernel, slopes)
         kernel = reverse_inputs(kernel) if bgr else kernel
-        self.stem = FusedConv(
-            space_to_depth_kernel(kernel, source, front), slopes.repeat(layout.front**2), maximum=maximum
-        )
+        self.stem_columns = pair * columns.stem
+        self.stem = FusedConv(kernel, slopes, (self.stem_columns, columns.stem), maximum=maximum)
         pool = pool_kernel(3)
-        self.i2 = FusedConv(space_to_depth_kernel(pad_inputs(pool, wide), front, (1, 1)))
-        self.i2_blocks: FusedConv | None = None
-        if layout.quarter > 1:
-            quarter = (layout.quarter, layout.quarter)
-            self.i2_blocks = FusedConv(space_to_depth_kernel(pad_inputs(pool, wide), front, quarter))
-        # Where the heads want the pooled image in the blocks that the stem gave it, they find it there.
         self.i1: FusedConv | None = None
+        self.i1_columns = pair * columns.half
         before = wide
-        if not (layout.split and layout.half == layout.front > 1):
-            pool = reverse_inputs(pool) if bgr else pool
-            self.i1 = FusedConv(space_to_depth_kernel(pool, source, (layout.half, layout.half)))
+        if not layout.shared_image:
+            kernel = reverse_inputs(pool) if bgr else pool
+            kernel = space_to_depth_kernel(kernel, (1, 1), (layout.half, layout.half))
+            self.i1 = FusedConv(kernel, columns=(self.i1_columns, columns.half))
             before = 0
+        # The image is pooled again from where it is alone, or else from the stem's outputs.
+        self.from_stem = self.i1 is None or layout.half > 1
+        self.i2_columns = _halved(columns.quarter)
+        self.i2 = FusedConv(pad_inputs(pool, wide if self.from_stem else 0), columns=(self.i2_columns, columns.quarter))
 
         kernel, slopes = fold_block(encoder.b1)
-        self.b1 = FusedConv(
-            space_to_depth_kernel(kernel, front, front), slopes.repeat(layout.front**2), maximum=maximum
+        self.b1 = FusedConv(kernel, slopes, (columns.front, columns.front), maximum=maximum)
+        self.level2_down = StrideESPGraph(encoder.level2_down, columns.level2, maximum=maximum)
+        self.level2 = nn.ModuleList(
+            DepthwiseESPGraph(block, columns.level2, maximum=maximum)  # type: ignore[arg-type]
+            for block in encoder.level2
         )
-        self.level2_down = StrideESPGraph(encoder.level2_down, layout, front)
-        self.level2 = nn.ModuleList(DepthwiseESPGraph(block, layout) for block in encoder.level2)  # type: ignore[arg-type]
         kernel, slopes = fold_block(encoder.b2)
         self.b2_image: FusedConv | None = None
         if layout.split:
             kernel, part = split_inputs(kernel, len(slopes) - 3, 3)
             self.b2_image = FusedConv(part)
         self.b2 = FusedConv(kernel, slopes, maximum=maximum)
-        self.level3_down = StrideESPGraph(encoder.level3_down, layout, (1, 1))
-        self.level3 = nn.ModuleList(DepthwiseESPGraph(block, layout) for block in encoder.level3)  # type: ignore[arg-type]
+        self.level3_down = StrideESPGraph(encoder.level3_down, 1, maximum=maximum)
+        self.level3 = nn.ModuleList(
+            DepthwiseESPGraph(block, 1, maximum=maximum)  # type: ignore[arg-type]
+            for block in encoder.level3
+        )
 
         self.detection: DetectionGraph | None = None
         if network.detection is not None:
@@ -422,7 +452,10 @@ class DeployGraph(nn.Module):
             self.c5 = FusedConv(*fold_block(encoder.c5), maximum=maximum)
             self.detection = DetectionGraph(network.litepan, network.spp, network.detection, network.anchors)
         self.pcaa = None if network.pcaa is None else AttentionGraph(network.pcaa, layout)
-        self.reduce = None if network.reduce is None else FusedConv(*fold_block(network.reduce), maximum=maximum)
+        self.reduce: FusedConv | None = None
+        self.head_columns = max(columns.quarter // 2, 1)
+        if network.reduce is not None:
+            self.reduce = FusedConv(*fold_block(network.reduce), (self.head_columns,) * 2, maximum=maximum)
         self.drivable: MaskGraph | None = None
         self.lane: MaskGraph | None = None
         if network.drivable is not None:
@@ -441,16 +474,23 @@ class DeployGraph(nn.Module):
         Raises:
             ShapeError: If it is another shape.
         """
+        columns = self.layout.columns
         x = self.normalise(image)
-        front = self.stem(x)
-        i2 = self.i2(front)
-        down2 = y = self.level2_down(self.b1(front))
+        front = self.stem(recolumn(x, 1, self.stem_columns))
+        i1 = front if self.i1 is None else self.i1(recolumn(x, 1, self.i1_columns))
+        if self.from_stem:
+            i2 = self.i2(recolumn(front, columns.stem, self.i2_columns))
+        else:
+            i2 = self.i2(recolumn(i1, columns.half, self.i2_columns))
+        x = self.b1(recolumn(front, columns.stem, columns.front))
+        down2 = y = self.level2_down(recolumn(x, columns.front, _halved(columns.level2)))
         for block in self.level2:
             y = block(y)
+        i2_pixels = recolumn(i2, columns.quarter, 1)
         if self.b2_image is None:
-            c2 = self.b2(torch.cat((y, down2, i2), 1))
+            c2 = self.b2(torch.cat((y, down2, i2_pixels), 1))
         else:
-            c2 = self.b2(torch.cat((y, down2), 1), self.b2_image(i2))
+            c2 = self.b2(concatenate((y, down2), columns.level2), self.b2_image(i2_pixels))
         down3 = y = self.level3_down(c2)
         for block in self.level3:
             y = block(y)
@@ -461,9 +501,8 @@ class DeployGraph(nn.Module):
             c4 = self.c4(c3)
             detection = self.detection(c3, c4, self.c5(c4))
         if self.reduce is not None:
-            attended = self.reduce(c3 if self.pcaa is None else self.pcaa(c3))
-            i1 = front if self.i1 is None else self.i1(x)
-            i2 = i2 if self.i2_blocks is None else self.i2_blocks(front)
+            attended = c3 if self.pcaa is None else self.pcaa(c3)
+            attended = self.reduce(recolumn(attended, 1, self.head_columns))
             if self.drivable is not None:
                 drivable = self.drivable(attended, i1, i2)
             if self.lane is not None:
@@ -490,9 +529,10 @@ class DeployGraph(nn.Module):
         return self
 
     def normalise(self, image: Tensor) -> Tensor:
-        """Return pixels as a normalised map, in blocks where the layout is channels-last.
+        """Return pixels as a normalised map (B, 3, H, W).
 
-        Scale and shift act on rows flattened to (B, rows, columns x 3), which is one pass over contiguous memory.
+        Channels-last, scale and shift act on rows flattened to (B, rows, columns x 3), which is one pass over
+        contiguous memory.
         """
         x = self._normalise(image)
         dtype = self.stem.weight.dtype
@@ -503,12 +543,9 @@ class DeployGraph(nn.Module):
             return image * self.scale.view(1, 3, 1, 1) + self.shift.view(1, 3, 1, 1)
         if image.ndim != 4 or image.shape[3] != 3:
             raise ShapeError(f"the deploy graph takes (B, H, W, 3) uint8, got {tuple(image.shape)}")
-        batch, height, width, _ = image.shape
         if not self.layout.channels_last:
             x = image.permute(0, 3, 1, 2).float()
             return x * self.scale.view(1, 3, 1, 1) + self.shift.view(1, 3, 1, 1)
-        # One long row of cells: (B, H, W / block x block x 3)
-        cells = width // self.block
-        x = image.reshape(batch, height, -1).float()
-        x = x * self.scale.repeat(cells) + self.shift.repeat(cells)
-        return x.view(batch, height, cells, self.block * 3).permute(0, 3, 1, 2)
+        batch, height, width, _ = image.shape
+        x = image.reshape(batch, height, -1).float() * self.scale.repeat(width) + self.shift.repeat(width)
+        return x.view(batch, height, width, 3).permute(0, 3, 1, 2)

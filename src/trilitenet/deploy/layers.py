@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,31 +11,56 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
 from trilitenet.deploy.rewrites import (
-    Blocks,
     Kernel,
     batch_norm_affine,
     compose_pointwise,
+    concatenated_cells,
     conv_kernel,
     fold_batch_norm,
     hierarchical_sum_matrix,
     prelu_as_maximum,
     prelu_slopes,
     space_to_depth_kernel,
+    transposed_in_columns,
 )
 from trilitenet.models.blocks import ConvBNPReLU, DepthwiseESP, DepthwiseSeparableConv, StrideESP
 
 __all__ = [
     "Activation",
+    "Columns",
     "DepthwiseESPGraph",
     "FusedConv",
     "FusedTransposedConv",
     "Layout",
     "SeparableGraph",
     "StrideESPGraph",
+    "concatenate",
     "constant",
     "depth_to_space",
     "fold_block",
+    "recolumn",
 ]
+
+
+@dataclasses.dataclass(frozen=True)
+class Columns:
+    """How many neighbouring columns share a cell, a stage of the deploy graph. See `recolumn`.
+
+    Attributes:
+        stem: Of the first convolution's output at 1/2.
+        front: At 1/2 in the encoder.
+        level2: In the ESP blocks at 1/4.
+        quarter: In the segmentation heads at 1/4.
+        half: In the segmentation heads at 1/2.
+        out: Where the heads make logits, at 1/2. Above 1, each row of a mask comes from a convolution of its own.
+    """
+
+    stem: int = 1
+    front: int = 1
+    level2: int = 1
+    quarter: int = 1
+    half: int = 1
+    out: int = 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,27 +68,32 @@ class Layout:
     """How the deploy graph is laid out in memory and operators. Every layout computes the same function.
 
     Attributes:
-        channels_last: Regroup pixels, bins and masks in (B, H, W, C) order, and write transposed convolutions as 1x1
-            convolutions; for runtimes whose convolutions are channels-last. Otherwise plain (B, C, H, W) operators of
-            at most four dimensions, and transposed convolutions as such.
-        front: Side of the pixel blocks that share a cell at 1/2 resolution in the encoder (1 or 2; see `rewrites`).
-        quarter: The same in the segmentation heads at 1/4 (1 or 2).
-        half: The same in the segmentation heads at 1/2, at most twice ``quarter``; above 1 it also writes their last
-            transposed convolutions as 1x1.
+        channels_last: Regroup pixels, bins and masks in (B, H, W, C) order, and write the last transposed convolutions
+            as 1x1 convolutions; for runtimes whose convolutions are channels-last. Otherwise plain (B, C, H, W)
+            operators of at most four dimensions, and transposed convolutions as such.
+        pointwise: Write the other transposed convolutions as 1x1 convolutions too; only channels-last.
+        columns: Cells of neighbouring columns; only channels-last, where they are views.
+        half: Side of the pixel blocks that share a cell in the segmentation heads at 1/2 (1 or 2; see `rewrites`);
+            only (B, C, H, W). 2 also writes their last transposed convolutions as 1x1.
         split: Write conv(concat(x, image)) as conv(x) + conv(image).
+        shared_image: Let the heads find the image at 1/2 among the stem's outputs, instead of pooling it by a
+            convolution of its own; only where the two have as many columns a cell.
         maximum: Write PReLU as max(x, a x) where that is exact.
     """
 
     channels_last: bool = True
-    front: int = 1
-    quarter: int = 1
+    pointwise: bool = False
+    columns: Columns = Columns()
     half: int = 1
     split: bool = False
+    shared_image: bool = False
     maximum: bool = False
 
     def __post_init__(self) -> None:
-        assert self.channels_last or self.front == self.quarter == 1
-        assert self.front <= self.half <= 2 * self.quarter
+        assert not self.pointwise or (self.channels_last and self.columns == Columns())
+        assert self.half == 1 if self.channels_last else self.columns == Columns()
+        assert self.split or max(self.columns.level2, self.columns.quarter, self.columns.half) == 1
+        assert not self.shared_image or (self.split and self.columns.stem == self.columns.half > 1)
 
 
 def constant(value: Tensor) -> nn.Parameter:
@@ -83,11 +114,47 @@ class Activation(nn.Module):
         return torch.maximum(x, x * self.slopes) if self.maximum else F.prelu(x, self.slopes)
 
 
-class FusedConv(nn.Module):
-    """Convolution with bias, an optional sum with another map, and an optional PReLU."""
+def recolumn(x: Tensor, before: int, after: int) -> Tensor:
+    """Let other numbers of neighbouring columns share a cell: (B, before x C, H, W / before) -> (B, after x C, ...).
 
-    def __init__(self, kernel: Kernel, slopes: Tensor | None = None, *, maximum: bool = False) -> None:
+    Channels-last it is a view: the same bytes, read as fewer and wider pixels, or as more and narrower ones.
+    """
+    if before == after:
+        return x
+    batch, channels, height, width = x.shape
+    x = x.permute(0, 2, 3, 1).reshape(batch, height, width * before // after, channels // before * after)
+    return x.permute(0, 3, 1, 2)
+
+
+def concatenate(maps: Sequence[Tensor], columns: int) -> Tensor:
+    """Concatenate the channels of maps in cells of so many columns; the result has none.
+
+    As rows of pixels, so that a runtime sees at once that its channels-last memory is the concatenation's.
+    """
+    if columns == 1:
+        return torch.cat(tuple(maps), 1)
+    batch, _, height, width = maps[0].shape
+    rows = [x.permute(0, 2, 3, 1).reshape(batch, height, width * columns, x.shape[1] // columns) for x in maps]
+    return torch.cat(rows, 3).permute(0, 3, 1, 2)
+
+
+class FusedConv(nn.Module):
+    """Convolution with bias, an optional sum with another map, and an optional PReLU.
+
+    Args:
+        kernel: The weights.
+        slopes: Those of the PReLU, one an output channel.
+        maximum: See `Layout`.
+        columns: Columns that share a cell of the input and of the output.
+    """
+
+    def __init__(
+        self, kernel: Kernel, slopes: Tensor | None = None, columns: tuple[int, int] = (1, 1), *, maximum: bool = False
+    ) -> None:
         super().__init__()
+        source, target = columns
+        kernel = space_to_depth_kernel(kernel, (1, source), (1, target))
+        slopes = None if slopes is None else slopes.repeat(target)
         self.weight = constant(kernel.weight)
         self.bias = constant(kernel.bias)
         self.act = None if slopes is None else Activation(slopes, maximum=maximum)
@@ -111,18 +178,40 @@ class FusedConv(nn.Module):
 
 
 class FusedTransposedConv(nn.Module):
-    """2x2 stride-2 transposed convolution with its batch normalisation folded, then PReLU."""
+    """2x2 stride-2 transposed convolution with its batch normalisation folded, then PReLU.
 
-    def __init__(self, deconv: nn.ConvTranspose2d, norm: nn.BatchNorm2d, slopes: Tensor, *, maximum: bool) -> None:
+    Args:
+        deconv: The network's.
+        norm: The normalisation after it.
+        slopes: Those of the PReLU.
+        columns: Columns that share a cell of the input; twice as many share one of the output. 0 for no cells.
+        maximum: See `Layout`.
+    """
+
+    def __init__(
+        self,
+        deconv: nn.ConvTranspose2d,
+        norm: nn.BatchNorm2d,
+        slopes: Tensor,
+        columns: int = 0,
+        *,
+        maximum: bool = False,
+    ) -> None:
         super().__init__()
         scale, shift = batch_norm_affine(norm)
-        self.weight = constant(deconv.weight.detach().double() * scale.view(1, -1, 1, 1))
-        self.bias = constant(shift)
-        self.act = Activation(slopes, maximum=maximum)
+        weight = deconv.weight.detach().double() * scale.view(1, -1, 1, 1)
+        self.stride = (2, 2)
+        if columns:
+            weight = transposed_in_columns(weight, columns)
+            self.stride = (2, 1)
+        self.weight = constant(weight)
+        copies = weight.shape[1] // len(shift)
+        self.bias = constant(shift.repeat(copies))
+        self.act = Activation(slopes.repeat(copies), maximum=maximum)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map (B, C, H, W) to (B, out, 2H, 2W)."""
-        out: Tensor = self.act(F.conv_transpose2d(x, self.weight, self.bias, 2))
+        """Map (B, C, H, W) to (B, out, 2H, 2W), or in cells of columns."""
+        out: Tensor = self.act(F.conv_transpose2d(x, self.weight, self.bias, self.stride))
         return out
 
 
@@ -146,18 +235,26 @@ def depth_to_space(x: Tensor, block: int) -> Tensor:
 
 
 class StrideESPGraph(nn.Module):
-    """Stride ESP: the reducing convolution, five dilated ones, and one 1x1 for sums, concat and normalisation."""
+    """Stride ESP: the reducing convolution, five dilated ones, and one 1x1 for sums, concat and normalisation.
 
-    def __init__(self, block: StrideESP, layout: Layout, source: Blocks) -> None:
+    Args:
+        block: The network's.
+        columns: Columns of the output that share a cell, and half of those of the input; 1 for none in either.
+        maximum: See `Layout`.
+    """
+
+    def __init__(self, block: StrideESP, columns: int, *, maximum: bool) -> None:
         super().__init__()
-        self.reduce = FusedConv(space_to_depth_kernel(conv_kernel(block.reduce), source, (1, 1)))
+        cells = (1, columns)
+        self.reduce = FusedConv(conv_kernel(block.reduce), columns=(2 * columns, columns) if columns > 1 else (1, 1))
         kernels = [conv_kernel(conv) for conv in (block.d1, block.d2, block.d4, block.d8, block.d16)]
-        self.branches = nn.ModuleList(FusedConv(kernel) for kernel in kernels)
-        matrix = hierarchical_sum_matrix(len(kernels[0].weight), len(kernels[1].weight))
+        self.branches = nn.ModuleList(FusedConv(space_to_depth_kernel(kernel, cells, cells)) for kernel in kernels)
+        channels = [len(kernel.weight) for kernel in kernels]
+        matrix = hierarchical_sum_matrix(*channels[:2])
         merge = Kernel(matrix.view(*matrix.shape, 1, 1), torch.zeros(len(matrix), dtype=torch.float64))
-        self.merge = FusedConv(
-            fold_batch_norm(merge, block.bn), prelu_slopes(block.act, len(matrix)), maximum=layout.maximum
-        )
+        merge = concatenated_cells(fold_batch_norm(merge, block.bn), channels, cells)
+        slopes = prelu_slopes(block.act, len(matrix)).repeat(columns)
+        self.merge = FusedConv(merge, slopes, maximum=maximum)
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the block."""
@@ -170,27 +267,48 @@ class DepthwiseESPGraph(nn.Module):
     """Depth-wise ESP: one 1x1, five depthwise convolutions, one 1x1, the residual sum, scale and PReLU.
 
     BN(x + T D y) = s (x + T D y + shift / s): the shift over the scale is the bias of the merging 1x1; the scale stays
-    behind the sum, where runtimes fuse it with the activation.
+    behind the sum, where runtimes fuse it with the activation. In cells of columns the residual is one more input of
+    the merging 1x1 instead, with s on the diagonal: OpenVINO regroups the result of a convolution without a sum for
+    nothing, that of one with a sum by copying.
+
+    Args:
+        block: The network's.
+        columns: Columns that share a cell; those convolutions whose dilation they do not divide become dense.
+        maximum: See `Layout`.
     """
 
-    def __init__(self, block: DepthwiseESP, layout: Layout) -> None:
+    def __init__(self, block: DepthwiseESP, columns: int, *, maximum: bool) -> None:
         super().__init__()
+        cells = (1, columns)
         reduce = compose_pointwise(conv_kernel(block.reduce.depthwise), conv_kernel(block.reduce.pointwise))
-        self.reduce = FusedConv(reduce)
+        self.reduce = FusedConv(reduce, columns=(columns, columns))
         pairs = (block.d1, block.d2, block.d4, block.d8, block.d16)
-        self.branches = nn.ModuleList(FusedConv(conv_kernel(pair.depthwise)) for pair in pairs)
+        kernels = [conv_kernel(pair.depthwise) for pair in pairs]
+        self.branches = nn.ModuleList(FusedConv(space_to_depth_kernel(kernel, cells, cells)) for kernel in kernels)
         pointwise = [conv_kernel(pair.pointwise).weight[:, :, 0, 0] for pair in pairs]
         matrix = hierarchical_sum_matrix(len(pointwise[0]), len(pointwise[1])) @ torch.block_diag(*pointwise)
         scale, shift = batch_norm_affine(block.bn_act.bn)
-        self.merge = FusedConv(Kernel(matrix.view(*matrix.shape, 1, 1), shift / scale))
-        self.scale = constant(scale.view(1, -1, 1, 1))
-        self.act = Activation(prelu_slopes(block.bn_act.act, len(scale)), maximum=layout.maximum)
+        slopes = prelu_slopes(block.bn_act.act, len(scale))
+        self.joined = columns > 1
+        if self.joined:
+            matrix = torch.cat((matrix * scale.unsqueeze(1), torch.diag(scale)), 1)
+            merge = Kernel(matrix.view(*matrix.shape, 1, 1), shift)
+            channels = [len(kernel.weight) for kernel in kernels] + [len(scale)]
+            merge = concatenated_cells(merge, channels, cells)
+            self.merge = FusedConv(merge, slopes.repeat(columns), maximum=maximum)
+        else:
+            self.merge = FusedConv(Kernel(matrix.view(*matrix.shape, 1, 1), shift / scale))
+            self.scale = constant(scale.view(1, -1, 1, 1))
+            self.act = Activation(slopes, maximum=maximum)
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the block."""
         y = self.reduce(x)
-        y = self.merge(torch.cat([branch(y) for branch in self.branches], 1))
-        out: Tensor = self.act((x + y) * self.scale)
+        parts = [branch(y) for branch in self.branches]
+        if self.joined:
+            joined: Tensor = self.merge(torch.cat((*parts, x), 1))
+            return joined
+        out: Tensor = self.act((x + self.merge(torch.cat(parts, 1))) * self.scale)
         return out
 
 

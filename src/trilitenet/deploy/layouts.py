@@ -4,22 +4,27 @@ from __future__ import annotations
 
 from typing import Final
 
-from trilitenet.deploy.layers import Layout
+from trilitenet.deploy.layers import Columns, Layout
 from trilitenet.errors import ConfigError, did_you_mean
 
 __all__ = ["LAYOUTS", "pick_layout"]
 
 LAYOUTS: Final[dict[str, Layout]] = {
-    "wide": Layout(front=2, quarter=2, half=2, split=True),
-    "heads": Layout(half=2),
-    "heads-split": Layout(half=2, split=True),
-    "pixels": Layout(),
+    "tiles-tiny": Layout(
+        columns=Columns(stem=4, front=4, level2=4, quarter=2, half=4, out=8), split=True, shared_image=True
+    ),
+    "tiles-small": Layout(columns=Columns(stem=4, level2=2, half=4, out=8), split=True),
+    "tiles-base": Layout(columns=Columns(stem=4, half=2, out=8), split=True),
+    "vectors-tiny": Layout(columns=Columns(quarter=2, half=4, out=8), split=True),
+    "vectors-small": Layout(columns=Columns(half=2, out=2), split=True),
+    "vectors-base": Layout(columns=Columns(out=2), split=True),
+    "pixels": Layout(pointwise=True),
     "planar": Layout(channels_last=False),
     "planar-maximum": Layout(channels_last=False, maximum=True),
     "planar-maximum-heads": Layout(channels_last=False, maximum=True, half=2, split=True),
     "planar-maximum-split": Layout(channels_last=False, maximum=True, split=True),
 }
-"""Layouts by name: pixels in 2x2 blocks everywhere, in the heads, nowhere; and (B, C, H, W) throughout."""
+"""Layouts by name: cells of columns for matrix tiles, for vectors, none; and (B, C, H, W) throughout."""
 
 
 def pick_layout(name: str, variant: str, runtime: str, *, amx: bool) -> Layout:
@@ -29,8 +34,7 @@ def pick_layout(name: str, variant: str, runtime: str, *, amx: bool) -> Layout:
         name: A key of `LAYOUTS`, or ``"auto"``.
         variant: ``"tiny"``, ``"small"`` or ``"base"``.
         runtime: ``"openvino"``, ``"onnxruntime"``, ``"cuda"`` (PyTorch), or another, which gets the planar one.
-        amx: Whether the processor has matrix tiles. They make the 4-fold arithmetic of blocks free; without them only
-            tiny, whose heads have fewer channels than a vector has lanes, gains from blocks.
+        amx: Whether the processor has matrix tiles, which make the further arithmetic of wide cells nearly free.
 
     Raises:
         ConfigError: If the name is unknown.
@@ -45,6 +49,4 @@ def pick_layout(name: str, variant: str, runtime: str, *, amx: bool) -> Layout:
         return LAYOUTS["pixels"]
     if runtime != "openvino":
         return LAYOUTS["planar"]
-    if amx:
-        return LAYOUTS["wide" if variant == "tiny" else "heads-split"]
-    return LAYOUTS["heads" if variant == "tiny" else "pixels"]
+    return LAYOUTS[f"{'tiles' if amx else 'vectors'}-{variant}"]

@@ -9,7 +9,7 @@ from typing import Any
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
 from trilitenet.errors import OutputError, import_extra
 
-__all__ = ["build_openvino", "has_amx", "save_openvino"]
+__all__ = ["build_openvino", "has_amx", "save_openvino", "with_own_biases"]
 
 
 def build_openvino(model: Any) -> Any:
@@ -22,7 +22,26 @@ def build_openvino(model: Any) -> Any:
         An ``openvino.Model``.
     """
     openvino = import_extra("openvino", "openvino")
-    return openvino.Core().read_model(model.SerializeToString(), b"")
+    return openvino.Core().read_model(with_own_biases(model).SerializeToString(), b"")
+
+
+def with_own_biases(model: Any) -> Any:
+    """Return a copy of an ONNX model whose convolutions share no bias: OpenVINO adds a shared one by a further pass."""
+    own = type(model)()
+    own.CopyFrom(model)
+    biases = {constant.name: constant for constant in own.graph.initializer}
+    seen: set[str] = set()
+    for node in own.graph.node:
+        if node.op_type != "Conv" or len(node.input) < 3:
+            continue
+        name = node.input[2]
+        if name in seen and name in biases:
+            node.input[2] = f"{node.name}.bias"
+            copy = own.graph.initializer.add()
+            copy.CopyFrom(biases[name])
+            copy.name = node.input[2]
+        seen.add(name)
+    return own
 
 
 def save_openvino(model: Any, path: str | os.PathLike[str], card: ModelCard, info: ArtefactInfo) -> None:

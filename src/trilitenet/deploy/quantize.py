@@ -25,14 +25,14 @@ __all__ = ["KEEP_STEPS", "kept_nodes", "quantize_onnx", "quantize_openvino"]
 
 KEEP_STEPS: Final[tuple[tuple[str, ...], ...]] = (
     (),
-    ("difference", "detection", "c4", "c5"),
-    ("difference", "detection", "c4", "c5", "out", "stem", "i1", "i2"),
-    ("difference", "detection", "c4", "c5", "out", "stem", "i1", "i2", "up2"),
-    ("difference", "detection", "c4", "c5", "out", "stem", "i1", "i2", "up2", "up1", "merge", "level2", "b1"),
+    ("difference", "detection", "c5"),
+    ("difference", "detection", "c5", "c4", "out", "stem", "i1", "i2"),
+    ("difference", "detection", "c5", "c4", "out", "stem", "i1", "i2", "up2"),
+    ("difference", "detection", "c5", "c4", "out", "stem", "i1", "i2", "up2", "up1", "merge", "level2", "b1"),
 )
 """Parts of the deploy graph that stay in floating point, one step of the fall-back after the other: nothing; what
-decides masks, and the whole way to the boxes from 1/16 on, whose maps are small and which INT8 costs 2 to 3 points of
-AP50; the first and last layers; the heads at 1/2; the heads and the encoder down to 1/4."""
+decides masks, and the way to the boxes behind the map at 1/16, whose maps are small and which INT8 costs points of
+AP50; the rest of that way, and the first and last layers; the heads at 1/2; the heads and the encoder down to 1/4."""
 
 
 def kept_nodes(names: Sequence[str], parts: Sequence[str]) -> list[str]:

@@ -13,6 +13,7 @@ mere regrouping of rows, and narrow convolutions become wide enough for a proces
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -26,6 +27,7 @@ __all__ = [
     "Kernel",
     "batch_norm_affine",
     "compose_pointwise",
+    "concatenated_cells",
     "conv_kernel",
     "depthwise_as_dense",
     "fold_attention",
@@ -43,7 +45,9 @@ __all__ = [
     "reverse_inputs",
     "space_to_depth_kernel",
     "split_inputs",
+    "take_outputs",
     "transposed_as_pointwise",
+    "transposed_in_columns",
     "upsample_kernel",
 ]
 
@@ -59,7 +63,7 @@ class Kernel(NamedTuple):
         bias: (out,).
         padding: Zeros added at the top, left, bottom, right.
         stride: Rows and columns.
-        dilation: Rows and columns (the same).
+        dilation: Rows and columns.
         groups: 1, or the number of channels for a depthwise convolution.
     """
 
@@ -67,7 +71,7 @@ class Kernel(NamedTuple):
     bias: Tensor
     padding: tuple[int, int, int, int] = (0, 0, 0, 0)
     stride: tuple[int, int] = (1, 1)
-    dilation: int = 1
+    dilation: tuple[int, int] = (1, 1)
     groups: int = 1
 
 
@@ -77,7 +81,8 @@ def conv_kernel(conv: nn.Conv2d) -> Kernel:
     bias = torch.zeros(len(weight), dtype=torch.float64) if conv.bias is None else conv.bias.detach().double()
     pad = conv.padding[0]
     assert isinstance(pad, int)
-    return Kernel(weight, bias, (pad,) * 4, (conv.stride[0], conv.stride[1]), conv.dilation[0], conv.groups)
+    stride, dilation = ((pair[0], pair[1]) for pair in (conv.stride, conv.dilation))
+    return Kernel(weight, bias, (pad,) * 4, stride, dilation, conv.groups)
 
 
 def fold_batch_norm(kernel: Kernel, norm: nn.BatchNorm2d) -> Kernel:
@@ -228,30 +233,50 @@ def transposed_as_pointwise(weight: Tensor, norm: nn.BatchNorm2d) -> Kernel:
     return Kernel(rows.reshape(-1, len(weight), 1, 1), shift.repeat(4))
 
 
-def nest_blocks(kernel: Kernel, outer: int) -> Kernel:
-    """Reorder the outputs of `transposed_as_pointwise` on a space-to-depth map into those of one finer map.
+def transposed_in_columns(weight: Tensor, columns: int) -> Tensor:
+    """Write a 2x2 stride-2 transposed convolution as a 2x1 one of stride (2, 1), from cells to cells twice as wide.
 
-    Where a cell holds outer x outer pixels and each becomes 2 x 2, outputs come as (r, c, i, j, channel), for pixel
-    (2r + i, 2c + j) of the cell. A map with blocks (2 outer, 2 outer) wants (r, i, c, j, channel).
+    Pixel c of a cell becomes pixels 2c and 2c + 1 of two cells, one a row.
 
     Args:
-        kernel: Its outputs are outer x outer x 2 x 2 x channels.
+        weight: (in, out, 2, 2).
+        columns: Pixels a cell of the input.
+
+    Returns:
+        (columns x in, 2 columns x out, 2, 1).
+    """
+    inputs, out = weight.shape[:2]
+    cells = weight.new_zeros(columns, inputs, columns, 2, out, 2)
+    for c in range(columns):
+        cells[c, :, c] = weight.permute(0, 3, 1, 2)
+    return cells.reshape(columns * inputs, columns * 2 * out, 2, 1)
+
+
+def nest_blocks(kernel: Kernel, outer: Blocks) -> Kernel:
+    """Reorder the outputs of a doubling convolution on a space-to-depth map into those of one finer map.
+
+    Where a cell holds rows x columns pixels and each becomes 2 x 2, outputs come as (r, c, i, j, channel), for pixel
+    (2r + i, 2c + j) of the cell. A map with blocks twice as large wants (r, i, c, j, channel).
+
+    Args:
+        kernel: Its outputs are rows x columns x 2 x 2 x channels.
         outer: Rows and columns of pixels a cell, before doubling.
     """
-    index = torch.arange(len(kernel.weight)).view(outer, outer, 2, 2, -1).permute(0, 2, 1, 3, 4).reshape(-1)
-    return kernel._replace(weight=kernel.weight[index], bias=kernel.bias[index])
+    return take_outputs(kernel, torch.arange(len(kernel.weight)).view(*outer, 2, 2, -1).permute(0, 2, 1, 3, 4))
 
 
 def space_to_depth_kernel(kernel: Kernel, source: Blocks, target: Blocks) -> Kernel:
-    """Rewrite a dense convolution for space-to-depth maps.
+    """Rewrite a convolution for space-to-depth maps.
 
-    Along one axis, output pixel T Y + r (cell Y, block size T, 0 <= r < T) reads input pixels S_c (T Y + r) + t - p for
-    taps t, with stride S_c and padding p. For input cells of B pixels, with B dividing S_c T, that is pixel
-    (S_c r + t - p) mod B of cell (S_c T / B) Y + floor((S_c r + t - p) / B): again a convolution, of stride S_c T / B,
-    whose taps are the distinct floors. Zero padding stays zero padding.
+    Along one axis, output pixel T Y + r (cell Y, block size T, 0 <= r < T) reads input pixels S_c (T Y + r) + D t - p
+    for taps t, with stride S_c, dilation D and padding p. For input cells of B pixels, with B dividing S_c T, that is
+    pixel (S_c r + D t - p) mod B of cell (S_c T / B) Y + floor((S_c r + D t - p) / B): again a convolution, of stride
+    S_c T / B, whose taps are the distinct floors, and whose dilation is what their distances have in common. Zero
+    padding stays zero padding. A depthwise convolution stays one where every output pixel reads its own place in the
+    cells, as with a dilation that B divides; else it becomes a dense one.
 
     Args:
-        kernel: Dense, of dilation 1.
+        kernel: Dense or depthwise.
         source: Blocks of the input map.
         target: Blocks of the output map.
 
@@ -260,35 +285,72 @@ def space_to_depth_kernel(kernel: Kernel, source: Blocks, target: Blocks) -> Ker
     """
     if source == (1, 1) == target:
         return kernel
-    assert kernel.groups == 1
-    assert kernel.dilation == 1
-    out, inputs, *size = kernel.weight.shape
-    steps, lows, highs = [], [], []
+    steps, lows, highs, gaps = [], [], [], []
+    own_place = source == target
     for axis in range(2):
         step, remainder = divmod(kernel.stride[axis] * target[axis], source[axis])
         assert remainder == 0
-        cells = [
-            (kernel.stride[axis] * r + t - kernel.padding[axis]) // source[axis]
-            for r in range(target[axis])
-            for t in range(size[axis])
-        ]
+        reads = _reads(kernel, axis, source[axis], target[axis])
+        own_place &= all(place == r for r, taps in enumerate(reads) for _, place in taps)
+        cells = [cell for taps in reads for cell, _ in taps]
         steps.append(step)
         lows.append(min(cells))
         highs.append(max(cells))
-    taps = [high - low + 1 for low, high in zip(lows, highs, strict=True)]
-    weight = kernel.weight.new_zeros(*target, out, *source, inputs, *taps)
-    for r in range(target[0]):
-        for c in range(target[1]):
-            for t in range(size[0]):
-                for u in range(size[1]):
-                    cell_y, y = divmod(kernel.stride[0] * r + t - kernel.padding[0], source[0])
-                    cell_x, x = divmod(kernel.stride[1] * c + u - kernel.padding[1], source[1])
-                    weight[r, c, :, y, x, :, cell_y - lows[0], cell_x - lows[1]] = kernel.weight[:, :, t, u]
-    weight = weight.reshape(math.prod(target) * out, math.prod(source) * inputs, *taps)
+        gaps.append(math.gcd(*(cell - min(cells) for cell in cells)) or 1)
     # The last cell of an axis of n output cells reads up to cell step (n - 1) + high of step n: high - step + 1 beyond.
     beyond = [max(high - step + 1, 0) for high, step in zip(highs, steps, strict=True)]
-    padding = (-lows[0], -lows[1], beyond[0], beyond[1])
-    return Kernel(weight, kernel.bias.repeat(math.prod(target)), padding, (steps[0], steps[1]))
+    geometry = Kernel(
+        kernel.weight,
+        kernel.bias.repeat(math.prod(target)),
+        (-lows[0], -lows[1], beyond[0], beyond[1]),
+        (steps[0], steps[1]),
+        (gaps[0], gaps[1]),
+    )
+    if kernel.groups > 1 and own_place:
+        weight = kernel.weight.repeat(math.prod(target), 1, 1, 1)
+        return geometry._replace(weight=weight, groups=len(weight))
+    dense = (depthwise_as_dense(kernel) if kernel.groups > 1 else kernel).weight
+    out, inputs, *_ = dense.shape
+    taps = [(high - low) // gap + 1 for low, high, gap in zip(lows, highs, gaps, strict=True)]
+    weight = dense.new_zeros(*target, out, *source, inputs, *taps)
+    for r, rows in enumerate(_reads(kernel, 0, source[0], target[0])):
+        for c, columns in enumerate(_reads(kernel, 1, source[1], target[1])):
+            for t, (cell_y, y) in enumerate(rows):
+                for u, (cell_x, x) in enumerate(columns):
+                    tap_y, tap_x = (cell_y - lows[0]) // gaps[0], (cell_x - lows[1]) // gaps[1]
+                    weight[r, c, :, y, x, :, tap_y, tap_x] = dense[:, :, t, u]
+    return geometry._replace(weight=weight.reshape(math.prod(target) * out, math.prod(source) * inputs, *taps))
+
+
+def _reads(kernel: Kernel, axis: int, source: int, target: int) -> list[list[tuple[int, int]]]:
+    """Return, for each output pixel of a cell and each tap, the input cell (from the output's) and the place in it."""
+    return [
+        [
+            divmod(kernel.stride[axis] * r + kernel.dilation[axis] * t - kernel.padding[axis], source)
+            for t in range(kernel.weight.shape[2 + axis])
+        ]
+        for r in range(target)
+    ]
+
+
+def concatenated_cells(kernel: Kernel, channels: Sequence[int], blocks: Blocks) -> Kernel:
+    """Rewrite a convolution of a concatenation for the concatenation of its parts' space-to-depth maps.
+
+    Channels of concatenated cells come by part, then by pixel; those of the cells of a concatenation by pixel first.
+
+    Args:
+        kernel: Dense; its inputs are the parts' channels in turn.
+        channels: Channels of each part.
+        blocks: Blocks of every part and of the output.
+    """
+    parts = [space_to_depth_kernel(part, blocks, blocks) for part in split_inputs(kernel, *channels)]
+    return parts[0]._replace(weight=torch.cat([part.weight for part in parts], 1))
+
+
+def take_outputs(kernel: Kernel, index: Tensor) -> Kernel:
+    """Keep the outputs of a dense convolution that ``index`` names, in its order."""
+    index = index.reshape(-1)
+    return kernel._replace(weight=kernel.weight[index], bias=kernel.bias[index])
 
 
 def mask_difference(blocks: int, threshold: float) -> Kernel:
