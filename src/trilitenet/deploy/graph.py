@@ -22,6 +22,7 @@ from trilitenet.deploy.layers import (
     Layout,
     SeparableGraph,
     StrideESPGraph,
+    columns_before,
     concatenate,
     constant,
     depth_to_space,
@@ -354,11 +355,6 @@ class MaskGraph(nn.Module):
         return x
 
 
-def _halved(columns: int) -> int:
-    """Return how many columns share a cell before a convolution of stride 2 whose output has ``columns``."""
-    return 2 * columns if columns > 1 else 1
-
-
 class DeployGraph(nn.Module):
     """The network as one graph from pixels to decoded boxes and masks.
 
@@ -421,7 +417,7 @@ class DeployGraph(nn.Module):
             before = 0
         # The image is pooled again from where it is alone, or else from the stem's outputs.
         self.from_stem = self.i1 is None or layout.half > 1
-        self.i2_columns = _halved(columns.quarter)
+        self.i2_columns = columns_before(columns.quarter)
         self.i2 = FusedConv(pad_inputs(pool, wide if self.from_stem else 0), columns=(self.i2_columns, columns.quarter))
 
         kernel, slopes = fold_block(encoder.b1)
@@ -483,7 +479,7 @@ class DeployGraph(nn.Module):
         else:
             i2 = self.i2(recolumn(i1, columns.half, self.i2_columns))
         x = self.b1(recolumn(front, columns.stem, columns.front))
-        down2 = y = self.level2_down(recolumn(x, columns.front, _halved(columns.level2)))
+        down2 = y = self.level2_down(recolumn(x, columns.front, columns_before(columns.level2)))
         for block in self.level2:
             y = block(y)
         i2_pixels = recolumn(i2, columns.quarter, 1)

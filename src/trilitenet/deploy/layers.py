@@ -34,6 +34,7 @@ __all__ = [
     "Layout",
     "SeparableGraph",
     "StrideESPGraph",
+    "columns_before",
     "concatenate",
     "constant",
     "depth_to_space",
@@ -112,6 +113,11 @@ class Activation(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Apply the activation."""
         return torch.maximum(x, x * self.slopes) if self.maximum else F.prelu(x, self.slopes)
+
+
+def columns_before(columns: int) -> int:
+    """Return how many columns share a cell before a convolution of stride 2 whose output has ``columns``."""
+    return 2 * columns if columns > 1 else 1
 
 
 def recolumn(x: Tensor, before: int, after: int) -> Tensor:
@@ -239,14 +245,14 @@ class StrideESPGraph(nn.Module):
 
     Args:
         block: The network's.
-        columns: Columns of the output that share a cell, and half of those of the input; 1 for none in either.
+        columns: Columns of the output that share a cell; of the input see `columns_before`.
         maximum: See `Layout`.
     """
 
     def __init__(self, block: StrideESP, columns: int, *, maximum: bool) -> None:
         super().__init__()
         cells = (1, columns)
-        self.reduce = FusedConv(conv_kernel(block.reduce), columns=(2 * columns, columns) if columns > 1 else (1, 1))
+        self.reduce = FusedConv(conv_kernel(block.reduce), columns=(columns_before(columns), columns))
         kernels = [conv_kernel(conv) for conv in (block.d1, block.d2, block.d4, block.d8, block.d16)]
         self.branches = nn.ModuleList(FusedConv(space_to_depth_kernel(kernel, cells, cells)) for kernel in kernels)
         channels = [len(kernel.weight) for kernel in kernels]
