@@ -220,6 +220,14 @@ def test_other_layouts_are_named(tmp_path: Path) -> None:
             check_dataset(folder)
 
 
+def test_coco_in_one_file_at_the_root_is_named(tmp_path: Path) -> None:
+    (tmp_path / "empty.json").touch()
+    (tmp_path / "notes.json").write_text('{"images": []}')
+    assert detect_layout(tmp_path)[0] == "unknown"
+    (tmp_path / "labels.json").write_text('{"images": [], "annotations": [], "categories": []}')
+    assert detect_layout(tmp_path) == ("coco", "COCO (labels.json)")
+
+
 def test_described_values_are_expected(root: Path) -> None:
     (root / "dataset.yaml").write_text(
         "drivable: {values: {255: direct, 77: alternative}}\nclasses: {vehicle: [car, cra]}\n"

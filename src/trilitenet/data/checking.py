@@ -13,6 +13,7 @@ import io
 import itertools
 import json
 import math
+import mmap
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -199,11 +200,23 @@ def detect_layout(root: str | Path) -> tuple[str, str]:
         return "bdd100k", "raw BDD100K (images/100k, labels)"
     if any(root.glob("annotations/*.json")) or any(root.glob("*/_annotations.coco.json")):
         return "coco", "COCO (annotations/*.json)"
+    for path in sorted(root.glob("*.json")):
+        if _mentions(path, b'"images"', b'"annotations"'):
+            return "coco", f"COCO ({path.name})"
     if (root / "data.yaml").is_file():
         return "yolo", "YOLO (data.yaml)"
     if any(root.glob("*.xml")):
         return "cvat", "CVAT (.xml)"
     return "unknown", "nothing known"
+
+
+def _mentions(path: Path, *words: bytes) -> bool:
+    """Return whether a file holds all of the words, without reading it into memory."""
+    try:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            return all(content.find(word) >= 0 for word in words)
+    except (OSError, ValueError):  # unreadable, or empty
+        return False
 
 
 def check_dataset(
