@@ -64,7 +64,7 @@ def test_variants_and_layouts(variant: str, layout: str) -> None:
 
 
 @pytest.mark.parametrize("size", [(384, 640), (256, 448), (640, 640)])
-@pytest.mark.parametrize("layout", ["tiles-tiny", "vectors-small", "pixels", "planar-maximum-heads"])
+@pytest.mark.parametrize("layout", ["tiles-tiny", "pixels", "planar-maximum-heads"])
 def test_sizes(size: tuple[int, int], layout: str) -> None:
     check(lively_network(), size, layout=LAYOUTS[layout])
 
