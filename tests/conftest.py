@@ -49,3 +49,20 @@ def artefacts(tmp_path_factory: pytest.TempPathFactory) -> Artefacts:
     from tests.artefacts import make_artefacts
 
     return make_artefacts(tmp_path_factory.mktemp("artefacts"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _large_signal_stack() -> None:
+    """Load OpenVINO's CPU plugin before anything else does, and keep it.
+
+    pytest's faulthandler gives the process a stack for signals that is too small once matrix tiles (AMX) are in use.
+    A core of OpenVINO brings a larger one, allows the tiles and, when it goes, gives back the small one: the next
+    signal that Python handles would end the process. The first core of a process stays here, see `openvino_core`.
+    """
+    try:
+        import openvino
+    except ImportError:
+        return
+    from trilitenet.inference.openvino_backend import openvino_core
+
+    openvino_core(openvino).get_property("CPU", "FULL_DEVICE_NAME")

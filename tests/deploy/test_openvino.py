@@ -13,6 +13,7 @@ from trilitenet.deploy.layouts import LAYOUTS, pick_layout
 from trilitenet.deploy.onnx import build_onnx
 from trilitenet.deploy.openvino import build_openvino, has_amx, save_openvino, with_own_biases
 from trilitenet.errors import OutputError
+from trilitenet.inference.openvino_backend import openvino_core
 
 openvino = pytest.importorskip("openvino")
 
@@ -35,7 +36,7 @@ def test_cells_of_columns_are_views(variant: str) -> None:
     graph = DeployGraph(network, pick_layout("auto", variant, "openvino", amx=True))
     info = ArtefactInfo("openvino", "bf16", (384, 640))
     model = build_openvino(build_onnx(graph, network.card, info))
-    compiled = openvino.Core().compile_model(model, "CPU", {"INFERENCE_PRECISION_HINT": "bf16"})
+    compiled = openvino_core(openvino).compile_model(model, "CPU", {"INFERENCE_PRECISION_HINT": "bf16"})
     copying = [
         node.get_friendly_name()
         for node in compiled.get_runtime_model().get_ordered_ops()

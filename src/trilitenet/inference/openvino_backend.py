@@ -22,7 +22,7 @@ from trilitenet.inference.exported import prepare_input, read_metadata, run_imag
 from trilitenet.processing.cores import usable_cores
 from trilitenet.structures import RawOutputs
 
-__all__ = ["OpenVINOBackend"]
+__all__ = ["OpenVINOBackend", "openvino_core"]
 
 _FIRST_USE = threading.Lock()
 _HINTS = {"fp32": "f32", "fp16": "f16", "bf16": "bf16"}
@@ -73,7 +73,7 @@ class OpenVINOBackend:
         if path.suffix.lower() == ".xml" and not weights.is_file():
             raise WeightsError(f"{path}: its weights are missing; keep {weights.name} beside it")
         with _FIRST_USE:
-            core = _core(openvino)
+            core = openvino_core(openvino)
         try:
             model = core.read_model(path)
         except RuntimeError as error:
@@ -195,7 +195,7 @@ class OpenVINOBackend:
 
 
 @functools.cache
-def _core(openvino: Any) -> Any:
+def openvino_core(openvino: Any) -> Any:
     """Return the process's one core, which lives as long as the process.
 
     A core's CPU plugin gives its thread another stack for signals and, when it goes, the stack that it found. Of two
