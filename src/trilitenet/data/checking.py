@@ -200,11 +200,11 @@ def detect_layout(root: str | Path) -> tuple[str, str]:
         return "bdd100k", "raw BDD100K (images/100k, labels)"
     if any(root.glob("annotations/*.json")) or any(root.glob("*/_annotations.coco.json")):
         return "coco", "COCO (annotations/*.json)"
+    if (root / "data.yaml").is_file():
+        return "yolo", "YOLO (data.yaml)"
     for path in sorted(root.glob("*.json")):
         if _mentions(path, b'"images"', b'"annotations"'):
             return "coco", f"COCO ({path.name})"
-    if (root / "data.yaml").is_file():
-        return "yolo", "YOLO (data.yaml)"
     if any(root.glob("*.xml")):
         return "cvat", "CVAT (.xml)"
     return "unknown", "nothing known"

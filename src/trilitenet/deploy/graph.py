@@ -23,6 +23,7 @@ from trilitenet.deploy.layers import (
     SeparableGraph,
     StrideESPGraph,
     columns_before,
+    columns_before_doubling,
     concatenate,
     constant,
     depth_to_space,
@@ -221,7 +222,7 @@ class UpStageGraph(nn.Module):
     Args:
         stage: The network's.
         layout: How to lay it out.
-        columns: Columns that share a cell of its output and of the image, and half of those of its input; 1 for none.
+        columns: Columns that share a cell of its output and of the image; of its input see `columns_before_doubling`.
         block: Side of the pixel blocks of the image and of its output; the input has none.
         before: Channels a pixel in front of those of the image, which are left alone; only where ``layout`` splits.
     """
@@ -237,7 +238,7 @@ class UpStageGraph(nn.Module):
             self.up = FusedConv(kernel, slopes.repeat(4), maximum=maximum)
             self.unblock = 2 // block
         else:
-            self.up = FusedTransposedConv(stage.up.deconv, stage.up.bn, slopes, columns // 2, maximum=maximum)
+            self.up = FusedTransposedConv(stage.up.deconv, stage.up.bn, slopes, columns, maximum=maximum)
         cells, blocks = (columns, columns), (block, block)
         kernel, slopes = fold_block(stage.conv1)
         slopes = slopes.repeat(block * block)
@@ -320,7 +321,7 @@ class MaskGraph(nn.Module):
     def forward(self, x: Tensor, i1: Tensor, i2: Tensor) -> Tensor:
         """Return the mask, (B, scale x H, scale x W) for an input of H x W pixels."""
         columns = self.columns
-        x = recolumn(self.up1(x, i2), columns.quarter, max(columns.half // 2, 1))
+        x = recolumn(self.up1(x, i2), columns.quarter, columns_before_doubling(columns.half))
         x = recolumn(self.up2(x, i1), columns.half, columns.out)
         if not self.difference:
             x = self.out(x)
@@ -449,7 +450,7 @@ class DeployGraph(nn.Module):
             self.detection = DetectionGraph(network.litepan, network.spp, network.detection, network.anchors)
         self.pcaa = None if network.pcaa is None else AttentionGraph(network.pcaa, layout)
         self.reduce: FusedConv | None = None
-        self.head_columns = max(columns.quarter // 2, 1)
+        self.head_columns = columns_before_doubling(columns.quarter)
         if network.reduce is not None:
             self.reduce = FusedConv(*fold_block(network.reduce), (self.head_columns,) * 2, maximum=maximum)
         self.drivable: MaskGraph | None = None

@@ -35,6 +35,7 @@ __all__ = [
     "SeparableGraph",
     "StrideESPGraph",
     "columns_before",
+    "columns_before_doubling",
     "concatenate",
     "constant",
     "depth_to_space",
@@ -120,6 +121,11 @@ def columns_before(columns: int) -> int:
     return 2 * columns if columns > 1 else 1
 
 
+def columns_before_doubling(columns: int) -> int:
+    """Return how many columns share a cell before a transposed convolution x2 whose output has ``columns``."""
+    return max(columns // 2, 1)
+
+
 def recolumn(x: Tensor, before: int, after: int) -> Tensor:
     """Let other numbers of neighbouring columns share a cell: (B, before x C, H, W / before) -> (B, after x C, ...).
 
@@ -190,7 +196,7 @@ class FusedTransposedConv(nn.Module):
         deconv: The network's.
         norm: The normalisation after it.
         slopes: Those of the PReLU.
-        columns: Columns that share a cell of the input; twice as many share one of the output. 0 for no cells.
+        columns: Columns that share a cell of the output; of the input see `columns_before_doubling`.
         maximum: See `Layout`.
     """
 
@@ -199,7 +205,7 @@ class FusedTransposedConv(nn.Module):
         deconv: nn.ConvTranspose2d,
         norm: nn.BatchNorm2d,
         slopes: Tensor,
-        columns: int = 0,
+        columns: int = 1,
         *,
         maximum: bool = False,
     ) -> None:
@@ -207,8 +213,8 @@ class FusedTransposedConv(nn.Module):
         scale, shift = batch_norm_affine(norm)
         weight = deconv.weight.detach().double() * scale.view(1, -1, 1, 1)
         self.stride = (2, 2)
-        if columns:
-            weight = transposed_in_columns(weight, columns)
+        if columns > 1:
+            weight = transposed_in_columns(weight, columns_before_doubling(columns))
             self.stride = (2, 1)
         self.weight = constant(weight)
         copies = weight.shape[1] // len(shift)
@@ -251,14 +257,13 @@ class StrideESPGraph(nn.Module):
 
     def __init__(self, block: StrideESP, columns: int, *, maximum: bool) -> None:
         super().__init__()
-        cells = (1, columns)
         self.reduce = FusedConv(conv_kernel(block.reduce), columns=(columns_before(columns), columns))
         kernels = [conv_kernel(conv) for conv in (block.d1, block.d2, block.d4, block.d8, block.d16)]
-        self.branches = nn.ModuleList(FusedConv(space_to_depth_kernel(kernel, cells, cells)) for kernel in kernels)
+        self.branches = nn.ModuleList(FusedConv(kernel, columns=(columns, columns)) for kernel in kernels)
         channels = [len(kernel.weight) for kernel in kernels]
         matrix = hierarchical_sum_matrix(*channels[:2])
         merge = Kernel(matrix.view(*matrix.shape, 1, 1), torch.zeros(len(matrix), dtype=torch.float64))
-        merge = concatenated_cells(fold_batch_norm(merge, block.bn), channels, cells)
+        merge = concatenated_cells(fold_batch_norm(merge, block.bn), channels, (1, columns))
         slopes = prelu_slopes(block.act, len(matrix)).repeat(columns)
         self.merge = FusedConv(merge, slopes, maximum=maximum)
 
@@ -285,12 +290,11 @@ class DepthwiseESPGraph(nn.Module):
 
     def __init__(self, block: DepthwiseESP, columns: int, *, maximum: bool) -> None:
         super().__init__()
-        cells = (1, columns)
         reduce = compose_pointwise(conv_kernel(block.reduce.depthwise), conv_kernel(block.reduce.pointwise))
         self.reduce = FusedConv(reduce, columns=(columns, columns))
         pairs = (block.d1, block.d2, block.d4, block.d8, block.d16)
         kernels = [conv_kernel(pair.depthwise) for pair in pairs]
-        self.branches = nn.ModuleList(FusedConv(space_to_depth_kernel(kernel, cells, cells)) for kernel in kernels)
+        self.branches = nn.ModuleList(FusedConv(kernel, columns=(columns, columns)) for kernel in kernels)
         pointwise = [conv_kernel(pair.pointwise).weight[:, :, 0, 0] for pair in pairs]
         matrix = hierarchical_sum_matrix(len(pointwise[0]), len(pointwise[1])) @ torch.block_diag(*pointwise)
         scale, shift = batch_norm_affine(block.bn_act.bn)
@@ -300,7 +304,7 @@ class DepthwiseESPGraph(nn.Module):
             matrix = torch.cat((matrix * scale.unsqueeze(1), torch.diag(scale)), 1)
             merge = Kernel(matrix.view(*matrix.shape, 1, 1), shift)
             channels = [len(kernel.weight) for kernel in kernels] + [len(scale)]
-            merge = concatenated_cells(merge, channels, cells)
+            merge = concatenated_cells(merge, channels, (1, columns))
             self.merge = FusedConv(merge, slopes.repeat(columns), maximum=maximum)
         else:
             self.merge = FusedConv(Kernel(matrix.view(*matrix.shape, 1, 1), shift / scale))
