@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import inspect
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -35,6 +37,9 @@ def greet(monkeypatch: pytest.MonkeyPatch) -> list[object]:
             raise OutputError("nobody: cannot be greeted")
         if name == "ctrl-c":
             raise KeyboardInterrupt
+        if name == "sigterm":
+            os.kill(os.getpid(), signal.SIGTERM)
+            calls.append("not reached")
         return Done() if name == "two" else f"hello {name}"
 
     monkeypatch.setattr(cli, "COMMANDS", (cli.Command("greet", "greet", "greeting"),))
@@ -66,8 +71,13 @@ def test_an_error_is_one_line(greet: list[object], capsys: pytest.CaptureFixture
     assert captured.out == ""
 
 
-def test_an_interruption_is_130(greet: list[object]) -> None:
-    assert cli.main(["greet", "ctrl-c"]) == 130
+@pytest.mark.parametrize("name", ["ctrl-c", "sigterm"])
+def test_an_interruption_is_130(greet: list[object], name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    assert cli.main(["greet", name]) == 130
+    assert capsys.readouterr().err == "error: interrupted\n"
+    assert greet == [(name, 1)]
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 @pytest.mark.parametrize(

@@ -161,3 +161,15 @@ def test_no_process_outlives_the_first(tmp_path: Path, script: Path, *, meets: b
             time.sleep(0.1)
         first.send_signal(signal.SIGKILL)
     assert ended(int(told.read_text()))
+
+
+@pytest.mark.parametrize(("native", "warned"), [(True, False), (False, True)])
+def test_bf16_without_instructions_for_it_is_told(
+    native: bool, warned: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: native)
+    with runtime.running_fabric("cpu", "bf16-mixed"):
+        assert ("--precision 32-true" in caplog.text) == warned
+    caplog.clear()
+    with runtime.running_fabric("cpu", "auto"), runtime.running_fabric("cpu", "32-true"):
+        assert not caplog.text

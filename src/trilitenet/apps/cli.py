@@ -6,19 +6,23 @@ called: ``trilitenet --help`` reads the summaries from the sources and loads nei
 
 What a command returns is shown by its ``summary()`` (or as it is, if it is text), followed by its ``errors``, and ends
 with ``exit_code`` where it has one. Exit codes: 0 done; 1 an error, told in one line; 2 a wrong command line; 130
-interrupted.
+interrupted, by Ctrl-C or SIGTERM.
 """
 
 from __future__ import annotations
 
 import ast
+import contextlib
 import importlib
 import logging
 import os
 import re
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import Any, Final, NamedTuple
 
 import cyclopts
@@ -172,7 +176,8 @@ def main(words: Sequence[str] | None = None) -> int:
         _check_command(words)
         words = _repeated(words)
         app = build_app(words)
-        result = app(words, print_error=False, exit_on_error=False, verbose=False, result_action="return_value")
+        with _heeding_sigterm():
+            result = app(words, print_error=False, exit_on_error=False, verbose=False, result_action="return_value")
         sys.stdout.write(_shown(result))
         sys.stdout.flush()
         for line in getattr(result, "errors", ()):
@@ -197,6 +202,26 @@ def main(words: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     return int(getattr(result, "exit_code", 0))
+
+
+@contextlib.contextmanager
+def _heeding_sigterm() -> Iterator[None]:
+    """Let SIGTERM interrupt as Ctrl-C does: what is half done is finished or taken back before the process ends."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    process = os.getpid()
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if os.getpid() != process:  # a fork: whoever started it ends it so
+            os._exit(128 + number)
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 class _MisuseError(Exception):

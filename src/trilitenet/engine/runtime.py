@@ -51,6 +51,11 @@ def pick_precision(precision: str, device: str) -> str:
     return "32-true"
 
 
+def _emulates(precision: str, device: str) -> bool:
+    """Return whether PyTorch has no kernels for a precision here: without AVX-512, bf16 on x86 takes 15 times fp32."""
+    return precision == "bf16-mixed" and device == "cpu" and not torch.ops.mkldnn._is_mkldnn_bf16_supported()
+
+
 def keep_freed_memory() -> None:
     """Tell glibc to keep freed memory for the next step, which needs the same again: a CPU step is a tenth faster.
 
@@ -149,10 +154,14 @@ def _build_fabric(device: str, precision: str, devices: int, num_nodes: int) -> 
         strategy = import_extra("lightning_fabric.strategies", "train").DDPStrategy(timeout=_PATIENCE)
         strategy._configure_launcher = lambda: None  # Fabric's would run the calling script again, which may be a REPL
         settings["strategy"] = strategy
+    picked = pick_precision(precision, accelerator)
     try:
-        return lightning.Fabric(accelerator=accelerator, precision=pick_precision(precision, accelerator), **settings)
+        fabric = lightning.Fabric(accelerator=accelerator, precision=picked, **settings)
     except (ValueError, TypeError) as error:
         raise ConfigError(f"device {device!r} with precision {precision!r}: {error}") from error
+    if _emulates(picked, accelerator) and fabric.global_rank == 0:
+        log.warning("this processor has no instructions for bf16: --precision 32-true is many times as fast")
+    return fabric
 
 
 def _connect(fabric: Any, devices: int, num_nodes: int) -> None:

@@ -241,7 +241,7 @@ async def _request(
         "raw_path": b"/v1/predict",
         "root_path": "",
         "query_string": query,
-        "headers": headers,
+        "headers": [(b"host", b"x"), *headers],
         "client": ("127.0.0.1", 1),
         "server": ("127.0.0.1", 2),
         "state": {},

@@ -146,6 +146,14 @@ def test_what_is_no_http_is_refused_in_the_form_of_every_refusal(
     assert json.loads(answer.split(b"\r\n\r\n")[1])["error"]["code"] == "bad_request"
 
 
+def test_a_request_needs_a_host(app: Application, run_app: Run) -> None:
+    running = run_app(app)
+    for version, status in ((b"1.1", b"400"), (b"1.0", b"200")):
+        with _connect(running) as connection:
+            connection.sendall(b"GET /healthz HTTP/" + version + b"\r\nconnection: close\r\n\r\n")
+            assert _read_all(connection).split()[1] == status
+
+
 @pytest.mark.parametrize("rest", [b"", b"x" * 70_000])
 def test_a_request_that_offers_another_protocol_keeps_its_body(
     app: Application, run_app: Run, jpeg: bytes, rest: bytes
@@ -468,6 +476,7 @@ def test_an_image_that_waits_too_long_gets_503(
 
 
 SCRIPT = """
+import contextlib
 import socket
 from tests.apps.server.conftest import FakeBackend
 from trilitenet.apps.server.application import create_app
@@ -477,21 +486,42 @@ from trilitenet.inference.predictor import Predictor
 
 set_up_logs()
 app = create_app(Predictor(FakeBackend(seconds=0.01)), "tiny", Settings(queue=32, threads=2, drain=0.5))
-build_server(app).run([socket.create_server(("127.0.0.1", 0), backlog=1024)])
+with contextlib.suppress(KeyboardInterrupt):
+    build_server(app).run([socket.create_server(("127.0.0.1", 0), backlog=1024)])
 """
 
 
-def test_sigterm_under_load_loses_no_accepted_request(jpeg: bytes) -> None:
+def _start_script() -> tuple[subprocess.Popen[str], int]:
+    """Start a service in a process of its own; return it and the port."""
     root = Path(__file__).resolve().parents[3]
     process = subprocess.Popen(
         [sys.executable, "-c", SCRIPT], cwd=root, stderr=subprocess.PIPE, text=True,
         env={**os.environ, "PYTHONPATH": f"{root}{os.pathsep}{root / 'src'}"},
     )  # fmt: skip
     assert process.stderr is not None
-    port = 0
-    while not port:
+    while True:
         entry = json.loads(process.stderr.readline())
-        port = int(entry["url"].split(":")[-1].strip("/")) if entry["message"] == "listening" else 0
+        if entry["message"] == "listening":
+            return process, int(entry["url"].split(":")[-1].strip("/"))
+
+
+def test_a_second_ctrl_c_ends_at_once_without_a_traceback() -> None:
+    process, port = _start_script()
+    assert process.stderr is not None
+    with socket.create_connection(("127.0.0.1", port)) as connection:
+        connection.sendall(b"POST /v1/predict HTTP/1.1\r\nhost: x\r\ncontent-length: 1000\r\n\r\nx")
+        process.send_signal(signal.SIGINT)
+        while json.loads(line := process.stderr.readline())["message"] != "Shutting down":
+            assert line
+        process.send_signal(signal.SIGINT)
+        start = time.monotonic()
+        _, errors = process.communicate(timeout=60)
+    assert time.monotonic() - start < 10
+    assert "Traceback" not in errors
+
+
+def test_sigterm_under_load_loses_no_accepted_request(jpeg: bytes) -> None:
+    process, port = _start_script()
     outcomes: Counter[str] = Counter()
     stop = threading.Event()
 

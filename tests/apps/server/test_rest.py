@@ -87,6 +87,24 @@ def test_overlay_is_the_picture_with_everything_drawn(client: TestClient, app: A
     assert Image.open(io.BytesIO(jpeg.content)).size == (80, 60)
 
 
+@pytest.mark.parametrize(
+    ("accept", "kind"),
+    [
+        ("image/PNG", "png"),
+        ("image/webp, image/png;q=0.5, */*;q=0.1", "png"),
+        ("image/png; q=0", "jpeg"),
+        ("image/png;q=0.00, */*", "jpeg"),
+        ("*/*", "jpeg"),
+        ("image/pngx, ;;,", "jpeg"),
+    ],
+)
+def test_an_overlay_is_png_where_the_client_asks_for_it(
+    client: TestClient, jpeg: bytes, accept: str, kind: str
+) -> None:
+    answer = client.post("/v1/predict?format=overlay", content=jpeg, headers={"accept": accept})
+    assert answer.headers["content-type"] == f"image/{kind}"
+
+
 def test_masks_are_one_palette_picture(client: TestClient, app: Application) -> None:
     pixels = picture(80, 60)
     answer = client.post("/v1/predict?format=masks", content=encode(pixels, "PNG"))

@@ -91,6 +91,8 @@ class Guard:
             exchange.log()
 
     def _check(self, scope: Scope, headers: Headers) -> None:
+        if scope["http_version"] == "1.1" and "host" not in headers:
+            raise ProblemError(400, "no_host", "a request of HTTP/1.1 needs a Host header")
         if self._token is not None and scope["path"] not in PUBLIC_PATHS:
             scheme, _, given = headers.get("authorization", "").partition(" ")
             digest = hashlib.sha256(given.strip().encode("utf-8", "surrogateescape")).digest()

@@ -273,6 +273,18 @@ class GuardedServer(uvicorn.Server):
         super().__init__(config)
         self._application = application
 
+    def run(self, sockets: list[socket.socket] | None = None) -> None:
+        """Serve until a signal asks to stop.
+
+        Raises:
+            KeyboardInterrupt: If a second one came before all that was accepted was answered.
+        """
+        try:
+            super().run(sockets)
+        except KeyboardInterrupt:  # uvicorn raises the signal again when it has heeded it
+            if self.force_exit:
+                raise
+
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start, and say where."""
         await super().startup(sockets)
@@ -294,6 +306,16 @@ class GuardedServer(uvicorn.Server):
         for spare in spares:
             await self._accept_waiting(spare)
         await super().shutdown(sockets)
+        if self.force_exit:
+            await self._end_at_once()
+
+    async def _end_at_once(self) -> None:
+        """End what is open after a second Ctrl-C: uvicorn leaves it to the end of the loop, with a traceback each."""
+        for connection in list(self.server_state.connections):
+            connection.transport.abort()
+        if self.server_state.tasks:
+            await asyncio.wait(self.server_state.tasks, timeout=_LAST_CALL)
+        await self.lifespan.shutdown()
 
     async def _accept_waiting(self, listener: socket.socket) -> None:
         """Accept what waits at a listener, then close it."""

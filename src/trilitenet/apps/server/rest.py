@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import io
 import json
+import re
 from collections.abc import Callable, Coroutine
 from typing import Annotated, Any, Final, Literal, TypeVar
 
@@ -33,6 +34,9 @@ Format = Literal["json", "overlay", "masks"]
 Confidence = Annotated[
     float | None, Query(ge=0.0, le=1.0, description="Keep boxes above this; the model's own threshold if left out.")
 ]
+
+_NOT_ACCEPTABLE: Final = re.compile(r"q=0(\.0{0,3})?")
+"""Weight of what a client does not want."""
 
 _PALETTE: Final = (0, 0, 0, *DRIVABLE_COLOUR, *LANE_COLOUR, 213, 94, 0)
 """Colours of the values 0 to 3 of a mask image, so that it can be looked at."""
@@ -196,12 +200,21 @@ def _finisher(output: Format, request: Request, service: Service) -> Callable[[O
         return lambda outcome: Response(
             mask_image(outcome.perception), media_type="image/png", headers=_server_timing(outcome)
         )
-    kind = "PNG" if "image/png" in request.headers.get("accept", "") else "JPEG"
+    kind = "PNG" if _accepts_png(request.headers.get("accept", "")) else "JPEG"
     return lambda outcome: Response(
         _encode(outcome.perception.draw(outcome.image), kind),
         media_type=f"image/{kind.lower()}",
         headers=_server_timing(outcome),
     )
+
+
+def _accepts_png(accept: str) -> bool:
+    """Return whether an Accept header names PNG, with a weight that is not 0 (RFC 9110, Section 12.5.1)."""
+    for entry in accept.lower().split(","):
+        kind, *parameters = (part.strip() for part in entry.split(";"))
+        if kind == "image/png":
+            return not any(_NOT_ACCEPTABLE.fullmatch(parameter) for parameter in parameters)
+    return False
 
 
 def _about(request: Request, service: Service) -> dict[str, Any]:
