@@ -25,6 +25,7 @@ from trilitenet.engine.figures import FIGURES
 from trilitenet.engine.report import Figure, Report
 from trilitenet.errors import BackendError, ConfigError, InputError, OutputError, ShapeError
 from trilitenet.inference.onnx_backend import OnnxBackend
+from trilitenet.inference.openvino_backend import openvino_core
 from trilitenet.inference.predictor import Predictor
 from trilitenet.models.trilitenet import build_network
 from trilitenet.models.weights import load_network, save_network
@@ -167,17 +168,18 @@ def test_what_cannot_be_written_is_told_in_one_line(
     # What only shows on writing, such as a full disk.
     monkeypatch.setattr(command, "build_onnx", lambda *_, **__: None)
 
-    def fill(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    def fill(*arguments: object) -> None:
+        (trial,) = (argument for argument in arguments if isinstance(argument, Path))
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(trial))
 
     monkeypatch.setattr(command, "save_onnx", fill)
-    with pytest.raises(OutputError, match=r"b\.onnx: cannot be written \(No space left on device\)$"):
+    with pytest.raises(OutputError, match=rf"^{tmp_path}/b\.onnx: cannot be written \(No space left on device\)$"):
         export(str(artefacts.folder / "weights.safetensors"), size="64x128", output=tmp_path / "b.onnx")
     # PyTorch aborts the process where it cannot write: it never gets the file.
     monkeypatch.setattr(torch.export, "export", lambda *_, **__: None)
     monkeypatch.setattr(torch.export, "save", lambda _, file, **__: file.write(b"program"))
     monkeypatch.setattr(Path, "write_bytes", fill)
-    with pytest.raises(OutputError, match=r"c\.pt2: cannot be written \(No space left on device\)$"):
+    with pytest.raises(OutputError, match=rf"^{tmp_path}/c\.pt2: cannot be written \(No space left on device\)$"):
         export(str(artefacts.folder / "weights.safetensors"), format="torch", size="64x128", output=tmp_path / "c.pt2")
     assert [path.name for path in tmp_path.iterdir()] == ["a.onnx"]
 
@@ -266,6 +268,21 @@ def test_torch_program(artefacts: Artefacts, tmp_path: Path, frames: Path) -> No
     assert trilitenet.load(done.path).backend.name == "torch program cpu"
 
 
+def _int8_weights(path: Path) -> list[int]:
+    """Return the largest magnitude of each tensor of INT8 weights in an artefact."""
+    if path.suffix == ".onnx":
+        onnx = pytest.importorskip("onnx")
+        kind = onnx.TensorProto.INT8
+        graph = onnx.load(path).graph
+        tensors = [onnx.numpy_helper.to_array(t) for t in graph.initializer if t.data_type == kind and len(t.dims) > 1]
+    else:
+        openvino = pytest.importorskip("openvino")
+        operators = openvino_core(openvino).read_model(path).get_ops()
+        constants = [op for op in operators if op.get_type_name() == "Constant"]
+        tensors = [op.get_data() for op in constants if op.get_element_type() == openvino.Type.i8]
+    return [int(np.abs(tensor.astype(int)).max()) for tensor in tensors]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("format_", ["openvino", "onnx"])
 def test_int8(
@@ -286,6 +303,7 @@ def test_int8(
     assert done.parity is not None
     text = path.read_bytes()
     assert (b"FakeQuantize" if format_ == "openvino" else b"QuantizeLinear") in text
+    assert max(_int8_weights(path)) <= 64  # more would overflow where the processor lacks VNNI
     assert "in floating point: difference, detection, c5" in done.summary()
     with trilitenet.load(path, threads=1) as predictor:  # on the runtime that it was quantised for and compared on
         assert predictor.backend.name == f"{'openvino' if format_ == 'openvino' else 'onnxruntime'} cpu int8"

@@ -103,7 +103,7 @@ def curves(folder: Path) -> list[tuple[int, str, float]]:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")  # two workers on a machine of one core
 def test_resume_is_bit_for_bit(scenes: Path, tmp_path: Path) -> None:
-    options = {"workers": 2, "multi_scale": (0.8, 1.6), "precision": "bf16-mixed", "balancing": "uncertainty"}
+    options = {"workers": 2, "multi_scale": (0.8, 1.6), "precision": "auto", "balancing": "uncertainty"}
     train(**settings(scenes, tmp_path / "straight", max_steps=20, **options))
     for steps in (9, 20):  # two steps an epoch: step 9 is in the middle of one
         result = train(resume=steps > 9, **settings(scenes, tmp_path / "parts", max_steps=steps, **options))
@@ -542,7 +542,7 @@ def test_a_checkpoint_with_the_wrong_content_is_told_in_one_line(scenes: Path, t
 
 @pytest.mark.parametrize("recipe", RECIPES, ids=lambda path: path.stem)
 def test_every_recipe_runs_three_steps(recipe: Path, scenes: Path, tmp_path: Path) -> None:
-    result = train(recipe, **settings(scenes, tmp_path, epochs=2, max_steps=3, batch_size=2))
+    result = train(recipe, **settings(scenes, tmp_path, epochs=2, max_steps=3, batch_size=2, precision="auto"))
     assert result.steps == 3
     assert recipe.read_text().startswith("# ")
     assert "Measured result" in recipe.read_text()

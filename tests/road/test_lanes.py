@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import time
-
 import cv2
 import numpy as np
 import pytest
@@ -121,21 +119,6 @@ def test_finds_the_true_lines_of_synthetic_scenes() -> None:
             found += min(apart, default=99.0) < 2.5
     assert wanted >= 25
     assert found / wanted >= 0.9
-
-
-def test_under_5_ms_a_frame() -> None:
-    scenes = SyntheticScenes(21, SIZE, faults=False)
-    slowest = []
-    for index in range(6):
-        mask = scenes[index].lane
-        assert mask is not None
-        times = []
-        for _ in range(15):
-            begin = time.perf_counter()
-            find_lines(mask)
-            times.append(time.perf_counter() - begin)
-        slowest.append(min(times))
-    assert np.mean(slowest) < 0.005
 
 
 def test_the_vanishing_point_of_a_straight_drive(drive: tuple[Scene, ...]) -> None:

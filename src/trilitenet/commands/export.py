@@ -380,7 +380,11 @@ def _trial(path: Path) -> Iterator[Path]:
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
-            yield Path(folder) / path.name
+            try:
+                with writing(path):
+                    yield Path(folder) / path.name
+            except OutputError as error:
+                raise OutputError(str(error).replace(folder, str(path.parent))) from error
             for part in Path(folder).iterdir():
                 part.replace(path.parent / part.name)
 
