@@ -28,7 +28,7 @@ from trilitenet.data.synthetic import SyntheticScenes
 from trilitenet.deploy.graph import DeployGraph
 from trilitenet.deploy.layouts import LAYOUTS, pick_layout
 from trilitenet.deploy.onnx import build_onnx
-from trilitenet.deploy.openvino import build_openvino, has_amx, save_openvino
+from trilitenet.deploy.openvino import build_openvino, save_openvino, vector_unit
 from trilitenet.deploy.quantize import KEEP_STEPS, quantize_openvino
 from trilitenet.inference.openvino_backend import OpenVINOBackend
 from trilitenet.inference.predictor import Predictor
@@ -108,7 +108,7 @@ def measure(weights: str, arguments: argparse.Namespace, folder: Path) -> dict[s
     variant = network.card.variant
     plain = plain_onnx(network)
     plain_model = CORE.read_model(plain, b"")
-    auto = pick_layout(arguments.layout, variant, "openvino", amx=has_amx())
+    auto = pick_layout(arguments.layout, variant, "openvino", unit=vector_unit())
     info = ArtefactInfo("openvino", "bf16", SIZE)
     proto = build_onnx(DeployGraph(network, auto), network.card, info)
     deploy = build_openvino(proto)
@@ -134,7 +134,7 @@ def measure(weights: str, arguments: argparse.Namespace, folder: Path) -> dict[s
 
         calls["plain eager fp32"] = eager
     if arguments.onnxruntime:
-        layout = pick_layout("auto", variant, "onnxruntime", amx=has_amx())
+        layout = pick_layout("auto", variant, "onnxruntime")
         calls["plain onnxruntime fp32"] = onnxruntime_call(plain, threads)
         data = build_onnx(DeployGraph(network, layout), network.card, info).SerializeToString()
         calls["deploy onnxruntime fp32"] = onnxruntime_call(data, threads)

@@ -101,12 +101,13 @@ def test_what_cannot_be_traced_is_one_plain_line(monkeypatch: pytest.MonkeyPatch
 
 
 def test_layouts_are_picked() -> None:
-    assert pick_layout("auto", "tiny", "openvino", amx=True) == LAYOUTS["tiles-tiny"]
-    assert pick_layout("auto", "base", "openvino", amx=False) == LAYOUTS["vectors-base"]
-    assert pick_layout("auto", "base", "cuda", amx=True) == LAYOUTS["pixels"]
-    assert not pick_layout("auto", "tiny", "onnxruntime", amx=True).channels_last
+    assert pick_layout("auto", "tiny", "openvino", unit="amx") == LAYOUTS["tiles-tiny"]
+    assert pick_layout("auto", "base", "openvino", unit="avx512") == LAYOUTS["vectors-base"]
+    assert pick_layout("auto", "tiny", "openvino", unit="other") == LAYOUTS["vectors-small"]
+    assert pick_layout("auto", "base", "cuda") == LAYOUTS["pixels"]
+    assert not pick_layout("auto", "tiny", "onnxruntime").channels_last
     with pytest.raises(ConfigError, match="did you mean 'pixels'"):
-        pick_layout("pixel", "tiny", "openvino", amx=False)
+        pick_layout("pixel", "tiny", "openvino")
 
 
 def test_kept_nodes_follow_modules() -> None:

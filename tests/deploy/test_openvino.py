@@ -11,7 +11,7 @@ from trilitenet.config import ArtefactInfo, ModelCard, Thresholds
 from trilitenet.deploy.graph import DeployGraph
 from trilitenet.deploy.layouts import LAYOUTS, pick_layout
 from trilitenet.deploy.onnx import build_onnx
-from trilitenet.deploy.openvino import build_openvino, has_amx, save_openvino, with_own_biases
+from trilitenet.deploy.openvino import build_openvino, save_openvino, vector_unit, with_own_biases
 from trilitenet.errors import OutputError
 from trilitenet.inference.openvino_backend import openvino_core
 
@@ -30,10 +30,10 @@ def test_what_cannot_be_written_is_told_in_one_line(tmp_path: Path) -> None:
 def test_cells_of_columns_are_views(variant: str) -> None:
     """Outside the attention, which regroups bins, nothing is copied to be laid out anew."""
     pytest.importorskip("onnx")
-    if not has_amx():
+    if vector_unit() != "amx":
         pytest.skip("layouts of processors with matrix tiles")
     network = lively_network(variant)
-    graph = DeployGraph(network, pick_layout("auto", variant, "openvino", amx=True))
+    graph = DeployGraph(network, pick_layout("auto", variant, "openvino", unit="amx"))
     info = ArtefactInfo("openvino", "bf16", (384, 640))
     model = build_openvino(build_onnx(graph, network.card, info))
     compiled = openvino_core(openvino).compile_model(model, "CPU", {"INFERENCE_PRECISION_HINT": "bf16"})

@@ -226,6 +226,40 @@ def test_upsample_kernel_has_the_sign_of_bilinear_interpolation() -> None:
     assert torch.equal(ours > 0, wanted > 0)
 
 
+@pytest.mark.parametrize("dilation", [1, 2])
+def test_trim_taps(dilation: int) -> None:
+    weight = torch.randn(3, 2, 3, 5, dtype=torch.float64)
+    weight[:, :, 0] = 0
+    weight[:, :, :, 3:] = 0
+    weight[0, 1, 1:, 0] = 0  # one column of one input alone stays
+    padding = (dilation, 2 * dilation, dilation, 2 * dilation)
+    kernel = Kernel(weight, torch.randn(3, dtype=torch.float64), padding, dilation=(dilation, dilation))
+    trimmed = rewrites.trim_taps(kernel)
+    assert trimmed.weight.shape == (3, 2, 2, 3)
+    assert trimmed.padding == (0, 2 * dilation, dilation, 0)
+    x = image(2)
+    assert_same(apply(trimmed, x), apply(kernel, x))
+
+
+def test_taps_that_read_the_image_are_not_trimmed() -> None:
+    kernel = Kernel(torch.zeros(1, 1, 3, 3, dtype=torch.float64), torch.ones(1, dtype=torch.float64), (0, 1, 0, 1))
+    trimmed = rewrites.trim_taps(kernel)
+    assert trimmed.weight.shape == (1, 1, 3, 2)
+    x = image(1)
+    assert torch.equal(apply(trimmed, x), apply(kernel, x))
+
+
+@pytest.mark.parametrize("columns", [1, 2, 8])
+def test_rows_of_a_doubled_mask_read_two_or_one_rows_of_cells(columns: int) -> None:
+    blocks = (2, 2 * columns)
+    kernel = rewrites.space_to_depth_kernel(rewrites.upsample_kernel(), blocks, blocks)
+    kernel = rewrites.nest_blocks(kernel, blocks)
+    rows = [rewrites.trim_taps(rewrites.take_outputs(kernel, row)) for row in torch.arange(16 * columns).view(4, -1)]
+    assert [row.weight.shape[2:] for row in rows] == [(2, 3), (1, 3), (1, 3), (2, 3)]
+    x = image(len(kernel.weight) // 4, 4, 6)
+    assert_same(torch.cat([apply(row, x) for row in rows], 1), apply(kernel, x))
+
+
 def test_prelu_as_maximum_only_where_it_is_exact() -> None:
     x = torch.linspace(-3, 3, 50)
     for slope in (-0.5, 0.0, 0.3, 1.0, 1.5):

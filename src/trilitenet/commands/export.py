@@ -25,7 +25,7 @@ from trilitenet.deploy.graph import DeployGraph, Masks
 from trilitenet.deploy.layouts import pick_layout
 from trilitenet.deploy.ncnn import build_ncnn, save_ncnn
 from trilitenet.deploy.onnx import build_onnx, save_onnx
-from trilitenet.deploy.openvino import build_openvino, has_amx, save_openvino
+from trilitenet.deploy.openvino import build_openvino, save_openvino, vector_unit
 from trilitenet.deploy.parity import TOLERANCES, Parity, compare
 from trilitenet.deploy.quantize import KEEP_STEPS, quantize_onnx, quantize_openvino
 from trilitenet.deploy.tensorrt import build_engine, is_installed, trtexec_line
@@ -203,7 +203,7 @@ def export(
     runtime = "planar" if portable else {"onnx": "onnxruntime"}.get(format, format)
     graph = DeployGraph(
         network,
-        pick_layout(layout, network.variant, runtime, amx=has_amx()),
+        pick_layout(layout, network.variant, runtime, unit=vector_unit()),
         masks=masks,
         mask_scale=mask_scale,
         bgr=bgr,

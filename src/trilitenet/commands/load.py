@@ -131,7 +131,7 @@ def _open_torch(model: str | os.PathLike[str], device: str, *, fastest: bool) ->
         from trilitenet.deploy.layouts import pick_layout
         from trilitenet.inference.cuda_graph_backend import CudaGraphBackend
 
-        layout = pick_layout("auto", network.variant, "cuda", amx=False)
+        layout = pick_layout("auto", network.variant, "cuda")
         graph = DeployGraph(network, layout, masks="probability").reduced(torch.float16)
         graph.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         return CudaGraphBackend(graph, network.card, str(pick_device(device)))

@@ -46,6 +46,7 @@ from trilitenet.deploy.rewrites import (
     split_inputs,
     take_outputs,
     transposed_as_pointwise,
+    trim_taps,
     upsample_kernel,
 )
 from trilitenet.errors import ConfigError, ShapeError
@@ -316,7 +317,7 @@ class MaskGraph(nn.Module):
         self.blocks = blocks
         # In cells of columns each row of a block comes from a convolution of its own.
         outputs = torch.arange(len(kernel.weight)).view(blocks[0] if self.columns.out > 1 else 1, -1)
-        last.extend(FusedConv(take_outputs(kernel, row)) for row in outputs)
+        last.extend(FusedConv(trim_taps(take_outputs(kernel, row))) for row in outputs)
 
     def forward(self, x: Tensor, i1: Tensor, i2: Tensor) -> Tensor:
         """Return the mask, (B, scale x H, scale x W) for an input of H x W pixels."""

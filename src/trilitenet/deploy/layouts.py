@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, Literal
 
 from trilitenet.deploy.layers import Columns, Layout
 from trilitenet.errors import ConfigError, did_you_mean
 
-__all__ = ["LAYOUTS", "pick_layout"]
+__all__ = ["LAYOUTS", "Unit", "pick_layout"]
+
+Unit = Literal["amx", "avx512", "other"]
+"""What a processor multiplies with: matrix tiles, vectors of 16 numbers, or narrower ones."""
 
 LAYOUTS: Final[dict[str, Layout]] = {
     "tiles-tiny": Layout(
@@ -27,14 +30,22 @@ LAYOUTS: Final[dict[str, Layout]] = {
 """Layouts by name: cells of columns for matrix tiles, for vectors, none; and (B, C, H, W) throughout."""
 
 
-def pick_layout(name: str, variant: str, runtime: str, *, amx: bool) -> Layout:
+_OPENVINO: Final[dict[Unit, dict[str, str]]] = {
+    "amx": {"tiny": "tiles-tiny", "small": "tiles-small", "base": "tiles-base"},
+    "avx512": {"tiny": "vectors-tiny", "small": "vectors-small", "base": "vectors-base"},
+    "other": {"tiny": "vectors-small", "small": "vectors-base", "base": "vectors-base"},
+}
+
+
+def pick_layout(name: str, variant: str, runtime: str, *, unit: Unit = "other") -> Layout:
     """Return a layout.
 
     Args:
         name: A key of `LAYOUTS`, or ``"auto"``.
         variant: ``"tiny"``, ``"small"`` or ``"base"``.
         runtime: ``"openvino"``, ``"onnxruntime"``, ``"cuda"`` (PyTorch), or another, which gets the planar one.
-        amx: Whether the processor has matrix tiles, which make the further arithmetic of wide cells nearly free.
+        unit: The processor's, by which OpenVINO's layout goes: the wider, the cheaper the further arithmetic of wide
+            cells.
 
     Raises:
         ConfigError: If the name is unknown.
@@ -49,4 +60,4 @@ def pick_layout(name: str, variant: str, runtime: str, *, amx: bool) -> Layout:
         return LAYOUTS["pixels"]
     if runtime != "openvino":
         return LAYOUTS["planar"]
-    return LAYOUTS[f"{'tiles' if amx else 'vectors'}-{variant}"]
+    return LAYOUTS[_OPENVINO[unit][variant]]

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
+from trilitenet.deploy.layouts import Unit
 from trilitenet.errors import OutputError, import_extra
 
-__all__ = ["build_openvino", "has_amx", "save_openvino", "with_own_biases"]
+__all__ = ["build_openvino", "save_openvino", "vector_unit", "with_own_biases"]
 
 
 def build_openvino(model: Any) -> Any:
@@ -65,9 +66,12 @@ def save_openvino(model: Any, path: str | os.PathLike[str], card: ModelCard, inf
         raise OutputError(f"{path}: cannot be written ({' '.join(str(error).split())}); is there room?") from error
 
 
-def has_amx() -> bool:
-    """Return whether the processor has matrix tiles (AMX), for which wider layouts pay."""
+def vector_unit() -> Unit:
+    """Return what the processor multiplies with, as far as the system tells."""
     try:
-        return "amx_bf16" in Path("/proc/cpuinfo").read_text(encoding="utf-8")
+        flags = set(Path("/proc/cpuinfo").read_text(encoding="utf-8").split())
     except OSError:
-        return False
+        return "other"
+    if "amx_bf16" in flags:
+        return "amx"
+    return "avx512" if "avx512f" in flags else "other"

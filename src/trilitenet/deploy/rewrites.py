@@ -48,6 +48,7 @@ __all__ = [
     "take_outputs",
     "transposed_as_pointwise",
     "transposed_in_columns",
+    "trim_taps",
     "upsample_kernel",
 ]
 
@@ -351,6 +352,25 @@ def take_outputs(kernel: Kernel, index: Tensor) -> Kernel:
     """Keep the outputs of a dense convolution that ``index`` names, in its order."""
     index = index.reshape(-1)
     return kernel._replace(weight=kernel.weight[index], bias=kernel.bias[index])
+
+
+def trim_taps(kernel: Kernel) -> Kernel:
+    """Leave out the first and last rows and columns of taps that are all zero, and the padding that only they read.
+
+    Some outputs of a convolution on cells read no further than their own cell: taken alone, they need fewer taps.
+    """
+    weight, padding = kernel.weight, list(kernel.padding)
+    for axis in range(2):
+        gap = kernel.dilation[axis]
+        taps = weight.shape[2 + axis]
+        used = weight.movedim(2 + axis, 0).flatten(1).any(1).nonzero().flatten().tolist() or [0]
+        first = min(used[0], padding[axis] // gap)
+        last = min(taps - 1 - used[-1], padding[axis + 2] // gap)
+        weight = weight.narrow(2 + axis, first, taps - first - last)
+        padding[axis] -= first * gap
+        padding[axis + 2] -= last * gap
+    top, left, bottom, right = padding
+    return kernel._replace(weight=weight, padding=(top, left, bottom, right))
 
 
 def mask_difference(blocks: int, threshold: float) -> Kernel:
