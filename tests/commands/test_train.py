@@ -542,7 +542,7 @@ def test_a_checkpoint_with_the_wrong_content_is_told_in_one_line(scenes: Path, t
 
 @pytest.mark.parametrize("recipe", RECIPES, ids=lambda path: path.stem)
 def test_every_recipe_runs_three_steps(recipe: Path, scenes: Path, tmp_path: Path) -> None:
-    result = train(recipe, **settings(scenes, tmp_path, epochs=2, max_steps=3, batch_size=2, precision="auto"))
+    result = train(recipe, **settings(scenes, tmp_path, epochs=2, max_steps=3, batch_size=2))
     assert result.steps == 3
     assert recipe.read_text().startswith("# ")
     assert "Measured result" in recipe.read_text()

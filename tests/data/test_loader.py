@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -59,6 +62,39 @@ def test_workers_change_nothing(dataset: DrivingDataset) -> None:
     for epoch, start in ((0, 0), (1, 2)):
         pairs = zip(alone.epoch(epoch, start=start), workers.epoch(epoch, start=start), strict=True)
         assert all(same(one, two) for one, two in pairs)
+
+
+_WITH_A_THREAD = """
+import multiprocessing, os, subprocess, sys, threading, time
+from trilitenet.data.loader import build_loader
+from trilitenet.data.reading import DrivingDataset
+from trilitenet.data.transforms import EvalTransform
+
+def start() -> None:
+    threading.Thread(target=time.sleep, args=(60,), daemon=True).start()
+
+os.register_at_fork(after_in_child=start)
+loader = build_loader(DrivingDataset(sys.argv[1], "train"), EvalTransform((64, 96)), batch_size=2, workers=1)
+batches = loader.epoch(0)
+next(batches)
+(worker,) = multiprocessing.active_children()
+for _ in range(20):
+    subprocess.run(["kill", "-TERM", str(worker.pid)], check=True)
+print(sum(1 for _ in batches), sum(1 for _ in loader.epoch(1)), worker.is_alive())
+"""
+"""As some runtimes do, a thread is started in each forked process before the loader hears of it."""
+
+
+@pytest.mark.skipif(not hasattr(os, "register_at_fork"), reason="no fork here")
+def test_no_thread_of_a_worker_takes_sigterm(dataset: DrivingDataset) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _WITH_A_THREAD, str(dataset.root)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert (done.stdout, done.returncode) == ("6 7 True\n", 0), done.stderr
 
 
 @pytest.mark.parametrize("workers", [0, 1])

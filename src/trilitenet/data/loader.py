@@ -24,6 +24,7 @@ from trilitenet.data.reading import MixedDataset, SampleSource
 from trilitenet.data.sample import Sample
 from trilitenet.data.transforms import Transform
 from trilitenet.errors import ConfigError, TriLiteNetError
+from trilitenet.processing.cores import held_back
 
 __all__ = ["Loader", "build_loader", "epoch_order"]
 
@@ -113,8 +114,10 @@ def _batches(loader: Iterable[Batch | TriLiteNetError]) -> Iterator[Batch]:
     Raises:
         RuntimeError: If a worker was killed; its text begins with ``DataLoader worker``.
     """
+    with held_back(signal.SIGTERM):  # in all threads of the workers, see `_start_worker`
+        batches = iter(loader)
     try:
-        for batch in loader:
+        for batch in batches:
             if isinstance(batch, TriLiteNetError):
                 raise batch
             yield batch
@@ -293,11 +296,11 @@ def _start_worker(worker: int) -> None:
     """Leave stopping to the process that trains, and keep a worker that was not forked to one core too.
 
     Ctrl-C reaches every process of a terminal, a scheduler's SIGTERM every one of a job, but the training process needs
-    its workers until the step at hand is done and saved.
+    its workers until the step at hand is done and saved. A library that was loaded before the fork may have started a
+    thread in the worker by now, which must not take SIGTERM either: the worker begins with it held back.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "sigwaitinfo"):
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
         threading.Thread(target=_heed_parent, daemon=True).start()
     if multiprocessing.get_start_method() != "fork":
         cv2.setNumThreads(0)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
 from typing import Any, TypeVar
 
-__all__ = ["ProcessPool", "usable_cores"]
+__all__ = ["ProcessPool", "held_back", "usable_cores"]
 
 T = TypeVar("T")
 
@@ -45,7 +45,7 @@ class ProcessPool(concurrent.futures.ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> concurrent.futures.Future[T]:
         """Add a task."""
-        with _held_back():  # in a process that starts with this task, too, until it can do without a word
+        with held_back(signal.SIGINT):  # in a process that starts with this task, too, until it can do without a word
             return super().submit(_interruptible, fn, *args, **kwargs)
 
     def __exit__(
@@ -55,12 +55,12 @@ class ProcessPool(concurrent.futures.ProcessPoolExecutor):
 
 
 @contextlib.contextmanager
-def _held_back() -> Iterator[None]:
-    """Let Ctrl-C wait for the end of the block, where the system can; processes started in it begin so."""
+def held_back(number: signal.Signals) -> Iterator[None]:
+    """Let a signal wait for the end of the block, where the system can; processes started in it begin so."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {number})
     try:
         yield
     finally:
