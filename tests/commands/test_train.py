@@ -495,6 +495,21 @@ def test_an_image_that_vanishes_or_breaks_is_named_and_the_run_can_go_on(
     assert train(resume=True, **options | {"max_steps": steps + 1}).steps == steps + 1
 
 
+def test_a_reading_process_that_is_killed_while_a_checkpoint_is_written_is_told_as_such(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train(**settings(scenes, tmp_path, max_steps=1))
+
+    def save(*_: object) -> None:
+        raise RuntimeError("DataLoader worker (pid 7) is killed by signal: Killed. ")
+
+    monkeypatch.setattr(torch, "save", save)
+    with pytest.raises(TrainingError, match=r"reads images was ended .*--workers .*--resume"):
+        train(resume=True, **settings(scenes, tmp_path, max_steps=2))
+    monkeypatch.undo()
+    assert state(tmp_path)["step"] == 1
+
+
 def test_a_reading_process_that_is_killed_is_told_in_one_line(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

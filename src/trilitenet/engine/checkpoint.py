@@ -41,6 +41,7 @@ def write_checkpoint(path: str | Path, state: dict[str, Any]) -> None:
 
     Raises:
         OutputError: If it cannot be written.
+        RuntimeError: If a worker of a loader is killed meanwhile; its text begins with ``DataLoader worker``.
     """
     path = Path(path)
     try:
@@ -50,6 +51,8 @@ def write_checkpoint(path: str | Path, state: dict[str, Any]) -> None:
             file.flush()
             os.fsync(file.fileno())
     except (OSError, RuntimeError) as error:
+        if str(error).startswith("DataLoader worker"):  # one was killed meanwhile, which PyTorch raises anywhere
+            raise
         # Where the disk is full, PyTorch's own error comes on top of the one that says so.
         reason = error.__context__ if isinstance(error.__context__, OSError) else error
         raise OutputError(f"{path}: cannot write the checkpoint ({reason})") from error
