@@ -510,6 +510,7 @@ def test_a_reading_process_that_is_killed_while_a_checkpoint_is_written_is_told_
     assert state(tmp_path)["step"] == 1
 
 
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # PyTorch's, which the news interrupts at times
 def test_a_reading_process_that_is_killed_is_told_in_one_line(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
