@@ -26,7 +26,10 @@ from trilitenet.data.transforms import Transform
 from trilitenet.errors import ConfigError, TriLiteNetError
 from trilitenet.processing.cores import held_back
 
-__all__ = ["Loader", "build_loader", "epoch_order"]
+__all__ = ["WORKER_LOST", "Loader", "build_loader", "epoch_order"]
+
+WORKER_LOST: Final = "DataLoader worker"
+"""How the text of the RuntimeError begins that tells of a worker that was killed; PyTorch raises it anywhere."""
 
 _ORDER_STREAM: Final = 0
 _SAMPLE_STREAM: Final = 1
@@ -112,7 +115,7 @@ def _batches(loader: Iterable[Batch | TriLiteNetError]) -> Iterator[Batch]:
     """Yield the batches.
 
     Raises:
-        RuntimeError: If a worker was killed; its text begins with ``DataLoader worker``.
+        RuntimeError: If a worker was killed; its text begins with `WORKER_LOST`.
     """
     with held_back(signal.SIGTERM):  # in all threads of the workers, see `_start_worker`
         batches = iter(loader)
@@ -123,7 +126,7 @@ def _batches(loader: Iterable[Batch | TriLiteNetError]) -> Iterator[Batch]:
             yield batch
     except (EOFError, OSError) as error:  # it was killed while it handed a batch over
         time.sleep(1.0)  # PyTorch raises which one as soon as the system tells of its end
-        raise RuntimeError(f"DataLoader worker lost ({error})") from error
+        raise RuntimeError(f"{WORKER_LOST} lost ({error})") from error
 
 
 class _Plan(torch.utils.data.Sampler[list[_Draw]]):

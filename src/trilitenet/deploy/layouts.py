@@ -35,6 +35,7 @@ _OPENVINO: Final[dict[Unit, dict[str, str]]] = {
     "avx512": {"tiny": "vectors-tiny", "small": "vectors-small", "base": "vectors-base"},
     "other": {"tiny": "vectors-small", "small": "vectors-base", "base": "vectors-base"},
 }
+"""OpenVINO's layout for a processor, a variant."""
 
 
 def pick_layout(name: str, variant: str, runtime: str, *, unit: Unit = "other") -> Layout:

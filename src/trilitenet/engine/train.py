@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from trilitenet.config import ModelCard
 from trilitenet.data.batches import Batch
 from trilitenet.data.identity import tell_apart
+from trilitenet.data.loader import WORKER_LOST
 from trilitenet.engine.checkpoint import random_state, read_checkpoint, set_random_state, write_checkpoint
 from trilitenet.engine.ema import MovingAverage
 from trilitenet.engine.guard import FiniteGuard
@@ -232,7 +233,7 @@ class Trainer:
             self.save()  # it came between two steps
             raise DataError(f"{error}; once that is mended, {RESUME}") from error
         except RuntimeError as error:
-            if not str(error).startswith("DataLoader worker"):
+            if not str(error).startswith(WORKER_LOST):
                 raise
             raise TrainingError(
                 f"a process that reads images was ended ({' '.join(str(error).split())}), mostly for want of memory; "
