@@ -60,8 +60,10 @@ def test_an_input_that_no_network_takes_is_refused() -> None:
     ("change", "message"),
     [
         ({}, "has no schema"),
-        ({"schema": "x"}, "schema must be a whole number, got 'x'"),
-        ({"schema": None}, "schema must be a whole number, got None"),
+        ({"schema": "x"}, "schema must be a whole number from 1 on, got 'x'"),
+        ({"schema": None}, "schema must be a whole number from 1 on, got None"),
+        ({"schema": True}, "schema must be a whole number from 1 on, got True"),
+        ({"schema": 0}, "schema must be a whole number from 1 on, got 0"),
         ({"schema": 99}, "schema 99 is newer than 1, which this version reads; upgrade"),
     ],
 )

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 import errno
+import os
+import stat
 from pathlib import Path
 
 import pytest
 
-from trilitenet.errors import OutputError, part_of, replacing, writing
+from trilitenet.errors import OutputError, free_name, part_of, replacing, write_file, writing
 
 
 def interrupt(path: Path, error: BaseException) -> None:
@@ -21,7 +23,6 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
         part.write_text("new")
         assert path.read_text() == "old"
     assert path.read_text() == "new"
-    assert path.stat().st_mode & 0o777 == 0o644
     for error in (KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")):
         with pytest.raises(type(error)):
             interrupt(path, error)
@@ -48,3 +49,28 @@ def test_a_temporary_name_is_no_longer_than_the_system_takes(tmp_path: Path, nam
     part_of(path).replace(path)
     assert path.read_text() == "newer"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_who_may_read_a_file_is_as_before_and_as_the_process_makes_files(tmp_path: Path) -> None:
+    old = tmp_path / "old"
+    old.touch()
+    old.chmod(0o640)
+    before = os.umask(0o077)
+    try:
+        for path in (old, tmp_path / "new"):
+            write_file(path, "text")
+    finally:
+        os.umask(before)
+    assert [stat.S_IMODE(path.stat().st_mode) for path in (old, tmp_path / "new")] == [0o640, 0o600]
+
+
+def test_a_link_stays_a_link(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "file")
+    write_file(tmp_path / "link", b"content")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "file").read_bytes() == b"content"
+
+
+def test_names_that_are_taken_get_a_number() -> None:
+    assert free_name("a", set()) == "a"
+    assert free_name("a", {"a", "a-2"}) == "a-3"

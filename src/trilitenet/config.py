@@ -201,6 +201,10 @@ class ModelCard:
     def __post_init__(self) -> None:
         check_size(self.input_size, "input_size")
         check_anchors(self.anchors)
+        if not self.class_names:
+            raise ConfigError("class_names must hold at least one name")
+        if not all(map(math.isfinite, self.mean)) or not all(0 < value < math.inf for value in self.std):
+            raise ConfigError(f"mean and std must be finite, and std above 0, got {self.mean} and {self.std}")
 
     @property
     def classes(self) -> int:
@@ -270,6 +274,10 @@ class ArtefactInfo:
     nms: bool = False
     trilitenet: str = ""
     schema: int = ARTEFACT_SCHEMA
+
+    def __post_init__(self) -> None:
+        if self.mask_scale not in (1, 2):
+            raise ConfigError(f"mask_scale must be 1 or 2, got {self.mask_scale}")
 
     @property
     def decides_masks(self) -> bool:
@@ -348,7 +356,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
         content: Any = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
+    except (yaml.YAMLError, ValueError) as error:  # the latter of text not in UTF-8, and of a date that there is not
         raise ConfigError(f"{path}: not YAML ({' '.join(str(error).split())})") from error
     if content is None:
         return {}
@@ -373,7 +381,7 @@ def _read_versioned(cls: type[_T], text: str, source: str, names: tuple[str, str
     what, schema_name = names
     try:
         mapping = json.loads(text)
-    except json.JSONDecodeError as error:
+    except (TypeError, ValueError) as error:  # the former of what is no text
         raise WeightsError(f"{source}: its {what} is not JSON ({error})") from error
     if not isinstance(mapping, dict):
         raise WeightsError(f"{source}: its {what} is not a JSON object")
@@ -382,9 +390,9 @@ def _read_versioned(cls: type[_T], text: str, source: str, names: tuple[str, str
             f"{source}: its {what} has no schema, which tells the layout; the file is damaged or foreign"
         )
     schema = mapping["schema"]
-    if not isinstance(schema, int):
+    if not isinstance(schema, int) or isinstance(schema, bool) or schema < 1:
         raise WeightsError(
-            f"{source}: {schema_name} schema must be a whole number, got {schema!r}; the file is damaged"
+            f"{source}: {schema_name} schema must be a whole number from 1 on, got {schema!r}; the file is damaged"
         )
     if schema > newest:
         raise WeightsError(

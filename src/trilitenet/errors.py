@@ -21,9 +21,10 @@ import contextlib
 import difflib
 import importlib
 import os
-import tempfile
+import secrets
+import stat
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Final
@@ -42,9 +43,11 @@ __all__ = [
     "WeightsError",
     "brief",
     "did_you_mean",
+    "free_name",
     "import_extra",
     "part_of",
     "replacing",
+    "write_file",
     "writing",
 ]
 
@@ -151,22 +154,48 @@ def part_of(path: Path) -> Path:
     return path.with_name(name)
 
 
+def free_name(name: str, taken: Collection[str]) -> str:
+    """Return a name that is not taken: itself, or with ``-2``, ``-3`` ... at the end."""
+    number, free = 1, name
+    while free in taken:
+        number += 1
+        free = f"{name}-{number}"
+    return free
+
+
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a name beside ``path``; the file written there takes its place in one step once the block is through.
 
-    At any time ``path`` is either the old file or the new one, whole; if the block raises, nothing of it stays.
+    At any time ``path`` is either the old file or the new one, whole; if the block raises, nothing of it stays. Who may
+    read it is as before, of a new file as the process makes files.
 
     Args:
         path: The file to write; its folder exists.
     """
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:_BEGINNING]}.", suffix=".part")
-    os.close(handle)
-    part = Path(name)
+    part = path.with_name(f".{path.name[:_BEGINNING]}.{secrets.token_hex(4)}.part")
+    os.close(os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     try:
         yield part
-        part.chmod(0o644)  # a temporary file is private
+        if path.is_file():
+            part.chmod(stat.S_IMODE(path.stat().st_mode))
         part.replace(path)
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+
+
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write a file whole or not at all, in a folder made for it; a device or a link, such as /dev/stdout, stays so.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_symlink() or (path.exists() and not path.is_file()):
+            path.write_bytes(data)
+            return
+        with replacing(path) as part:
+            part.write_bytes(data)

@@ -146,6 +146,7 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object]]] = {
     ),
     "index names no image": ("index", lambda root: (root / "index.csv").open("a").write("nobody,train,x\n")),
     "no such split": ("split-missing", lambda root: (root / "dataset.yaml").write_text("splits: [train, val, test]\n")),
+    "a split without images": ("split-missing", lambda root: (root / "images" / "test").mkdir()),
     "no such ego mask": ("ego-mask", lambda root: (root / "dataset.yaml").open("a").write("ego_mask: nope.png\n")),
     "odd shapes": (
         "anchors",
@@ -188,7 +189,7 @@ ONE_PLACE = (
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_faults_do_not_hide_one_another(root: Path) -> None:
     planted = {fault: FAULTS[fault] for fault in FAULTS if fault not in ONE_PLACE}
-    assert len(planted) == 16
+    assert len(planted) == 17
     for _, plant in planted.values():
         plant(root)
     assert kinds(check_dataset(root)) == {kind for kind, _ in planted.values()}

@@ -145,11 +145,19 @@ def put_older_label(root: Path) -> None:
     os.utime(path, (10**9, 10**9))
 
 
+def swap_labels(root: Path) -> None:
+    """Rename two files, which leaves the number, the bytes and the times of the split's files as they were."""
+    first, second = (root / f"det_annotations/train/train_000{number}.json" for number in (0, 3))
+    other = first.with_suffix(".other")
+    first.rename(other), second.rename(first), other.rename(second)
+
+
 CHANGES: dict[str, Callable[[Path], object]] = {
     "a label goes": lambda root: (root / "det_annotations/train/train_0001.json").unlink(),
     "an older label comes": put_older_label,
     "classes": lambda root: describe(root, "classes: {vehicle: [bus]}\nego_masks: {train_000: bonnet.png}\n"),
     "thresholds": lambda root: describe(root, "drivable: {above: 254}\nego_masks: {train_000: bonnet.png}\n"),
+    "two labels change places": swap_labels,
     "no ego mask": lambda root: describe(root, ""),
     "another ego mask": lambda root: cv2.imwrite(str(root / "bonnet.png"), np.full((72, 128), 255, np.uint8)),
     "attributes": lambda root: (root / "index.csv").write_text("name,split,source\ntrain_0001,train,city\n"),
@@ -256,3 +264,21 @@ def test_a_split_without_images_is_left_out(root: Path, tmp_path: Path) -> None:
     assert set(prepare(root, tmp_path / "out", canvas=CANVAS)) == {"train", "val"}
     with pytest.raises(DataError, match="no images"):
         prepare(root, tmp_path / "other", canvas=CANVAS, splits=["test"])
+
+
+def test_what_is_prepared_again_is_read_anew(root: Path, tmp_path: Path) -> None:
+    prepare(root, tmp_path / "out", canvas=CANVAS)
+    assert PreparedDataset(tmp_path / "out", "val")[0].image.any()
+    for path in (root / "images/val").iterdir():
+        cv2.imwrite(str(path), np.full((50, 90, 3), 200, np.uint8))
+    prepare(root, tmp_path / "out", canvas=CANVAS)
+    assert abs(PreparedDataset(tmp_path / "out", "val")[0].image.astype(int) - 200).max() < 4
+
+
+def test_whether_a_task_is_labelled_is_known(root: Path, tmp_path: Path) -> None:
+    for path in (root / "ll_seg_annotations/train").iterdir():
+        path.unlink()
+    prepare(root, tmp_path / "out", canvas=CANVAS)
+    for dataset in (DrivingDataset(root, "train"), PreparedDataset(tmp_path / "out", "train")):
+        assert [dataset.has_labels(task) for task in ("detection", "drivable", "lane")] == [True, True, False]
+    assert not PreparedDataset(tmp_path / "out", "train", tasks=("lane",)).has_labels("detection")

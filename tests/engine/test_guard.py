@@ -16,7 +16,7 @@ GOOD, BAD = torch.tensor(1.0), torch.tensor(float("nan"))
 def make(interval: int) -> tuple[nn.BatchNorm1d, torch.optim.Optimizer, FiniteGuard]:
     network = nn.BatchNorm1d(2)
     optimiser = build_optimiser([network], lr=0.1, betas=(0.9, 0.99), weight_decay=0.0)
-    return network, optimiser, FiniteGuard(network, optimiser, interval)
+    return network, optimiser, FiniteGuard([network], optimiser, interval)
 
 
 @pytest.mark.parametrize(("loss", "norm"), [(BAD, GOOD), (GOOD, BAD), (torch.tensor(float("inf")), GOOD)])
@@ -62,3 +62,19 @@ def test_without_waiting_the_optimiser_skips_by_itself() -> None:
     optimiser.step()
     assert guard.bad_steps == 0
     assert bool((network.weight < weight).all())
+
+
+def test_an_average_that_has_followed_a_bad_step_is_put_back_too() -> None:
+    network = nn.BatchNorm1d(2)
+    average = nn.BatchNorm1d(2)
+    optimiser = build_optimiser([network], lr=0.1, betas=(0.9, 0.99), weight_decay=0.0)
+    guard = FiniteGuard([network, average], optimiser, 3)
+    kept = {name: buffer.clone() for name, buffer in average.named_buffers()}
+    for step, loss in enumerate((GOOD, BAD, GOOD)):
+        network(torch.full((4, 2), float("nan")) if loss is BAD else torch.randn(4, 2))
+        assert guard.good(step, (), loss, loss)
+        average.load_state_dict(network.state_dict())
+    torch.testing.assert_close(dict(network.named_buffers()), kept)
+    guard.look()
+    average.load_state_dict(network.state_dict())
+    assert all(buffer.isfinite().all() for buffer in average.buffers())

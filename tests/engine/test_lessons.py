@@ -100,6 +100,18 @@ def test_labels_and_teacher_share_by_weight(tmp_path: Path) -> None:
     same(first, again)
 
 
+def test_what_no_draw_takes_is_not_read(tmp_path: Path) -> None:
+    sample = scene()
+    lessons = Lessons(save(tmp_path, sample), ("vehicle",))
+    whole = lessons.of(sample, ("detection",))
+    assert whole is not None
+    assert whole.boxes is not None
+    assert (whole.drivable, whole.lane) == (None, None)
+    (tmp_path / "drivable" / "a.png").write_bytes(b"")
+    still = TrainTransform(SIZE, Augmentation(rotation=0, scale=0, translation=0, flip=0))
+    assert TaughtTransform(still, lessons, (0.0, 0.0, 0.0))(sample, np.random.default_rng(0)).drivable is not None
+
+
 def test_confidence_makes_objects_and_ignored_regions(tmp_path: Path) -> None:
     sample = scene()
     lessons = Lessons(save(tmp_path, sample, (0.5, 0.3)), ("vehicle",), (0.1, 0.5))

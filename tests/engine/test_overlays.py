@@ -64,3 +64,18 @@ def test_boxes_below_the_confidence_are_not_drawn() -> None:
         )
         np.testing.assert_allclose(picture[150, 100], colour, atol=40)
         assert not picture[150, 120:180].any()
+
+
+def test_a_box_of_another_class_is_false_and_one_on_the_own_car_is_not_drawn() -> None:
+    black = np.zeros((720, 1280, 3), np.uint8)
+    valid = np.ones((720, 1280), np.bool_)
+    valid[600:] = False
+    truth = np.array([[300, 300, 600, 500]], np.float32)
+    sample = Sample(name="a", image=black, boxes=truth, class_id=np.zeros(1, np.int64), valid=valid)
+    found = np.concatenate([truth, np.array([[700, 610, 1000, 710]], np.float32)])
+    boxes = Boxes(found, np.array([0.9, 0.8], np.float32), np.array([1, 0]))
+    small = shrunken(black)
+    seen = Perception(size=(720, 1280), class_names=("car", "bus"), boxes=boxes)
+    picture = _decoded(error_overlay(small, sample, seen, "detection", confidence=0.25))
+    np.testing.assert_allclose(picture[133, 100], FALSE, atol=40)
+    assert not picture[200:, 230:340].any()

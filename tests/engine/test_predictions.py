@@ -133,3 +133,23 @@ def test_with_one_class_any_category_is_it(tmp_path: Path) -> None:
     assert boxes is not None
     assert boxes.class_id.tolist() == [0, 0]
     assert boxes.confidence.tolist() == pytest.approx([0.4, 0.1])  # best first
+
+
+def test_what_is_interrupted_does_not_look_whole(tmp_path: Path, rng: np.random.Generator) -> None:
+    def write() -> None:
+        with PredictionWriter(tmp_path, ("detection",)) as writer:
+            writer.write("a", perception(rng, 3))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("value", ["NaN", "Infinity"])
+def test_a_box_that_is_not_finite_is_named(tmp_path: Path, value: str) -> None:
+    (tmp_path / "detections.json").write_text(
+        f'[{{"image_id": "a", "category_id": 1, "bbox": [{value}, 1, 5, 5], "score": 0.5}}]'
+    )
+    with pytest.raises(DataError, match="a bbox must be four numbers"):
+        SavedPredictions(tmp_path, ("car",))

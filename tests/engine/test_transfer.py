@@ -32,6 +32,14 @@ def test_nothing_that_fits_is_an_error() -> None:
         initialise(nn.Linear(2, 2), nn.Conv2d(1, 1, 1))
 
 
+def test_weights_of_another_variant_are_refused_and_nothing_is_taken() -> None:
+    network = build_network("base")
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    with pytest.raises(ConfigError, match=r"of 2,350,206 parameters .* another variant"):
+        initialise(network, build_network("tiny"))
+    torch.testing.assert_close(network.state_dict(), before)
+
+
 def test_frozen_parts_learn_nothing() -> None:
     network = build_network("tiny").train()
     count = freeze(network, ("encoder", "lane.up1"))

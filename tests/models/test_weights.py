@@ -16,9 +16,9 @@ from safetensors.torch import load_file, save_file
 
 from tests.models.conftest import published_state
 from trilitenet import build_network, load_network
-from trilitenet.config import ModelCard, Thresholds
+from trilitenet.config import CARD_KEY, ModelCard, Thresholds
 from trilitenet.errors import ConfigError, OutputError, WeightsError
-from trilitenet.models.weights import CARD_KEY, import_published, read_card, rename_published, save_network
+from trilitenet.models.weights import import_published, read_card, rename_published, save_network
 
 
 @pytest.fixture
@@ -237,3 +237,15 @@ def test_what_could_not_be_loaded_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match="not finite in fp16"):
         save_network(network, path, network.card, half=True)
     assert path.read_bytes() == before
+
+
+def test_a_published_checkpoint_of_odd_tensors_is_named(tmp_path: Path) -> None:
+    torch.save({"model.0.level1.conv.weight": torch.tensor(3.0)}, tmp_path / "odd.pth")
+    with pytest.raises(WeightsError, match="not a published TriLiteNet checkpoint"):
+        import_published(tmp_path / "odd.pth", tmp_path / "out.safetensors")
+
+
+@pytest.mark.parametrize("wrong", [{"std": (0.0, 1.0, 1.0)}, {"mean": (float("nan"), 0.0, 0.0)}, {"class_names": ()}])
+def test_a_card_that_cannot_be_used_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        ModelCard("tiny", **wrong)

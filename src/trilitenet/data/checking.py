@@ -38,6 +38,7 @@ from trilitenet.data.reading import (
     read_index,
 )
 from trilitenet.errors import DataError, import_extra
+from trilitenet.processing.boxes import best_side_ratio
 from trilitenet.processing.cores import ProcessPool
 from trilitenet.processing.images import upright_size
 
@@ -64,7 +65,7 @@ KINDS: Final[dict[str, str]] = {
     "leak-sequence": "a sequence (index.csv) with images in two splits",
     "index": "index.csv and the images disagree",
     "ego-mask": "a mask of the own car that dataset.yaml names and that cannot be read",
-    "split-missing": "a split that dataset.yaml names and that has no images",
+    "split-missing": "a split that dataset.yaml names, or a folder of one, and that has no images",
     "anchors": "too many boxes that no anchor fits",
 }
 """Everything that is looked for."""
@@ -283,7 +284,7 @@ def check_dataset(
     for name in filter(None, {description.ego_mask, *description.ego_masks.values()}):
         if not _is_mask(root / name):
             collector.add("ego-mask", "", name)
-    for split in description.splits:
+    for split in dict.fromkeys((*description.splits, *names)):
         if not names.get(split):
             collector.add("split-missing", split, f"{IMAGE_FOLDER}/{split}")
     box_sizes = np.concatenate(
@@ -592,9 +593,7 @@ def _anchor_recall(sizes: NDArray[np.float32], anchors: Anchors, ratio: float = 
     if not len(sizes):
         return float("nan")
     every = np.array([anchor for level in anchors for anchor in level], np.float32)
-    quotient = sizes[:, None] / every
-    worst = np.maximum(quotient, 1 / quotient).max(axis=2).min(axis=1)
-    return float((worst < ratio).mean())
+    return float((best_side_ratio(sizes, every) > 1 / ratio).mean())
 
 
 def _means(facts: dict[str, list[_Facts]], task: str) -> dict[str, float]:

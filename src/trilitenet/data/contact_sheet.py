@@ -15,11 +15,26 @@ from trilitenet.processing.drawing import draw
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.structures import Boxes, Perception
 
-__all__ = ["contact_sheet", "draw_sample", "pick", "thumbnail"]
+__all__ = ["as_perception", "contact_sheet", "draw_sample", "pick", "thumbnail"]
 
 _IGNORED_COLOUR: Final = (150, 150, 150)
 _INVALID_COLOUR: Final = (213, 94, 0)
 _TEXT_ROWS: Final = 18
+
+
+def as_perception(sample: Sample, class_names: Sequence[str]) -> Perception:
+    """Return a sample's labels as what a network would have seen with confidence 1."""
+    boxes = None
+    if sample.boxes is not None and sample.class_id is not None:
+        boxes = Boxes(sample.boxes, np.ones(len(sample.boxes), np.float32), sample.class_id)
+    return Perception(
+        size=sample.size,
+        class_names=tuple(class_names),
+        boxes=boxes,
+        drivable=None if sample.drivable is None else sample.drivable.astype(np.bool_),
+        lane=None if sample.lane is None else sample.lane.astype(np.bool_),
+        image=sample.image,
+    )
 
 
 def draw_sample(sample: Sample, class_names: Sequence[str]) -> NDArray[np.uint8]:
@@ -35,17 +50,7 @@ def draw_sample(sample: Sample, class_names: Sequence[str]) -> NDArray[np.uint8]
     Returns:
         (H, W, 3) uint8 RGB.
     """
-    boxes = None
-    if sample.boxes is not None and sample.class_id is not None:
-        boxes = Boxes(sample.boxes, np.ones(len(sample.boxes), np.float32), sample.class_id)
-    perception = Perception(
-        sample.size,
-        tuple(class_names),
-        boxes,
-        None if sample.drivable is None else sample.drivable.astype(np.bool_),
-        None if sample.lane is None else sample.lane.astype(np.bool_),
-    )
-    canvas = draw(perception, sample.image, hide=("labels",))
+    canvas = draw(as_perception(sample, class_names), sample.image, hide=("labels",))
     for valid, way in ((sample.valid, 1), (sample.drivable_valid, -1), (sample.lane_valid, -1)):
         if valid is not None:
             rows, columns = np.indices(sample.size)

@@ -38,7 +38,14 @@ from trilitenet.data.description import (
 )
 from trilitenet.data.lane_edges import centre_line, pair_edges
 from trilitenet.data.rasterise import check_finite, draw_line, fill_polygon
-from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, IMAGE_ENDINGS, IMAGE_FOLDER, LANE_FOLDER
+from trilitenet.data.reading import (
+    DETECTION_FOLDER,
+    DRIVABLE_FOLDER,
+    IMAGE_ENDINGS,
+    IMAGE_FOLDER,
+    LABEL_FILES,
+    LANE_FOLDER,
+)
 from trilitenet.data.records import (
     AreaLabel,
     ImageRecord,
@@ -66,13 +73,6 @@ IGNORE_VALUE: Final = 64
 """Mask value of pixels that are neither foreground nor background."""
 
 _STATE_FOLDER: Final = ".conversion"
-
-_TASK_FILES: Final = {
-    "detection": (DETECTION_FOLDER, ".json"),
-    "drivable": (DRIVABLE_FOLDER, ".png"),
-    "lane": (LANE_FOLDER, ".png"),
-}
-"""Folder and ending of each task's labels."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,7 +196,7 @@ def _convert_split(
     source: RecordSource, split: str, names: list[str], root: Path, options: ConversionOptions, workers: int
 ) -> Iterator[str]:
     """Convert a split's images and yield their names one by one; at the end its files are those of a first run."""
-    folders = [root / folder / split for folder in (IMAGE_FOLDER, *(folder for folder, _ in _TASK_FILES.values()))]
+    folders = [root / folder / split for folder in (IMAGE_FOLDER, *(folder for folder, _ in LABEL_FILES.values()))]
     path = _journal_path(root / _STATE_FOLDER, split)
     earlier = _read_journal(path)
     for name in earlier.keys() - set(names):
@@ -582,7 +582,7 @@ def _files(split: str, summary: Mapping[str, Any]) -> set[str]:
     """Return the files of an image's line of the journal, from the root."""
     if "image" not in summary:
         return set()
-    labels = {f"{_TASK_FILES[task][0]}/{split}/{summary['name']}{_TASK_FILES[task][1]}" for task in summary["labelled"]}
+    labels = {f"{LABEL_FILES[task][0]}/{split}/{summary['name']}{LABEL_FILES[task][1]}" for task in summary["labelled"]}
     return {f"{IMAGE_FOLDER}/{split}/{summary['image']}"} | labels
 
 
@@ -594,7 +594,7 @@ def _is_complete(root: Path, split: str, summary: Mapping[str, Any]) -> bool:
 
 def _remove_files(root: Path, split: str, name: str, keep: Collection[str] = ()) -> None:
     """Remove what an earlier run wrote of an image and this one does not."""
-    for folder, ending in (*((IMAGE_FOLDER, ending) for ending in IMAGE_ENDINGS), *_TASK_FILES.values()):
+    for folder, ending in (*((IMAGE_FOLDER, ending) for ending in IMAGE_ENDINGS), *LABEL_FILES.values()):
         file = f"{folder}/{split}/{name}{ending}"
         if file not in keep:
             (root / file).unlink(missing_ok=True)

@@ -10,7 +10,7 @@ from typing import Any, Final
 import yaml
 
 from trilitenet.config import TASKS, Task, parse, read_yaml
-from trilitenet.errors import ConfigError, DataError
+from trilitenet.errors import ConfigError, DataError, write_file
 
 __all__ = [
     "DESCRIPTION_FILE",
@@ -123,7 +123,7 @@ def write_description(root: Path, description: DatasetDescription) -> None:
     default = dataclasses.asdict(DatasetDescription())
     content = {key: _plain(value) for key, value in dataclasses.asdict(description).items() if value != default[key]}
     text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)
-    (root / DESCRIPTION_FILE).write_text(text, encoding="utf-8")
+    write_file(root / DESCRIPTION_FILE, text)
 
 
 def _plain(value: Any) -> Any:

@@ -111,16 +111,17 @@ def _collate(samples: list[Sample | TriLiteNetError]) -> Batch | TriLiteNetError
     return collate(whole)
 
 
-def _batches(loader: Iterable[Batch | TriLiteNetError]) -> Iterator[Batch]:
-    """Yield the batches.
+def _batches(loader: Iterable[Batch | TriLiteNetError], plan: _Plan, batches: list[list[_Draw]]) -> Iterator[Batch]:
+    """Yield the batches of a plan.
 
     Raises:
         RuntimeError: If a worker was killed; its text begins with `WORKER_LOST`.
     """
     with held_back(signal.SIGTERM):  # in all threads of the workers, see `_start_worker`
-        batches = iter(loader)
+        plan.batches = batches
+        following = iter(loader)
     try:
-        for batch in batches:
+        for batch in following:
             if isinstance(batch, TriLiteNetError):
                 raise batch
             yield batch
@@ -223,11 +224,11 @@ class Loader:
         draws = [_Draw(epoch, position, int(index)) for position, index in enumerate(order)]
         batches = [draws[first : first + self.batch_size] for first in range(0, len(draws), self.batch_size)]
         index, count = self._share
-        self._plan.batches = [
+        shares = [
             batch[index * len(batch) // count : (index + 1) * len(batch) // count]
             for batch in batches[start : len(self)]
         ]
-        return _batches(self._loader)
+        return _batches(self._loader, self._plan, shares)
 
 
 def build_loader(

@@ -304,6 +304,15 @@ class PreparedDataset:
         attributes: dict[str, str] = json.loads(self._lines[index])["attributes"]
         return attributes
 
+    def has_labels(self, task: Task) -> bool:
+        """Return whether an image is labelled for a task; looks up to the first."""
+        if self._tasks is not None and task not in self._tasks:
+            return False
+        entries = map(json.loads, self._lines)
+        if task == "detection":
+            return any(entry["boxes"] is not None for entry in entries)
+        return any(f"{task}.npy" in entry["parts"] for entry in entries)
+
     def fingerprint(self, index: int) -> str:
         """Return a hash of what the shard's index says of a sample: boxes, attributes, and the size of its parts."""
         return hashlib.sha256(self._lines[index]).hexdigest()[:16]
@@ -380,12 +389,19 @@ class _Place:
         return path
 
 
-@functools.lru_cache(maxsize=512)
 def _map_shard(path: Path) -> NDArray[np.uint8]:
     try:
-        return np.asarray(np.memmap(path, np.uint8, "r"))
+        state = path.stat()
+        return _mapped(path, (state.st_ino, state.st_size, state.st_mtime_ns))
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be read ({error}); prepare the data set again") from error
+
+
+@functools.lru_cache(maxsize=512)
+def _mapped(path: Path, state: tuple[int, int, int]) -> NDArray[np.uint8]:
+    """Map a file; ``state`` tells it from one that was there before."""
+    del state
+    return np.asarray(np.memmap(path, np.uint8, "r"))
 
 
 def _run_jobs(plan: _Plan, jobs: list[tuple[str, int, list[str]]], workers: int) -> Iterator[int]:
@@ -520,7 +536,7 @@ def _open_out(plan: _Plan) -> None:
     for part in plan.out.glob(".*.part"):  # of a run that was killed
         part.unlink()
     if not state.is_file():
-        state.write_text(json.dumps({**_settings(plan), "splits": {}, "shards": {}}), encoding="utf-8")
+        _replace_state(plan, {}, {})
 
 
 def _forget(plan: _Plan, splits: Iterable[str]) -> None:
@@ -584,21 +600,25 @@ def _common_files(root: Path) -> Iterator[Path]:
             yield root / name
 
 
-def _fingerprint(root: Path, split: str) -> list[int]:
-    """Return what changes when a split changes: number of files, their bytes, and when the newest was written."""
-    stats = [path.stat() for path in _files_of(root, split)]
-    return [len(stats), sum(stat.st_size for stat in stats), max((stat.st_mtime_ns for stat in stats), default=0)]
+def _fingerprint(root: Path, split: str) -> str:
+    """Return what changes when a split changes: the SHA-256 of its files' names, sizes and when they were written."""
+    return _digest(root, sorted(_files_of(root, split)))
 
 
 def _made_from(dataset: DrivingDataset) -> str:
     """Return the SHA-256 of which files samples are made from, how large they are and when they were written."""
-    digest = hashlib.sha256(f"layout {_LAYOUT}\n".encode())
     paths = [*_common_files(dataset.root)]
     for index, name in enumerate(dataset.names):
         paths += [dataset.image_path(index), dataset.root / DETECTION_FOLDER / dataset.split / f"{name}.json"]
         paths += [dataset.root / folder / dataset.split / f"{name}.png" for folder in (DRIVABLE_FOLDER, LANE_FOLDER)]
+    return _digest(dataset.root, paths)
+
+
+def _digest(root: Path, paths: Iterable[Path]) -> str:
+    """Return the SHA-256 of the names, sizes and times of writing of those files that are there."""
+    digest = hashlib.sha256(f"layout {_LAYOUT}\n".encode())
     for path in paths:
         with contextlib.suppress(FileNotFoundError):
             stat = path.stat()
-            digest.update(f"{path.relative_to(dataset.root)}\n{stat.st_size} {stat.st_mtime_ns}\n".encode())
+            digest.update(f"{path.relative_to(root)}\n{stat.st_size} {stat.st_mtime_ns}\n".encode())
     return digest.hexdigest()

@@ -17,6 +17,7 @@ import csv
 import functools
 import hashlib
 import json
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -28,13 +29,14 @@ from numpy.typing import NDArray
 from trilitenet.config import Task
 from trilitenet.data.description import DatasetDescription, MaskMeaning, class_table, read_description
 from trilitenet.data.sample import Sample
-from trilitenet.errors import DataError, brief
+from trilitenet.errors import DataError, brief, did_you_mean
 
 __all__ = [
     "DETECTION_FOLDER",
     "DRIVABLE_FOLDER",
     "IMAGE_ENDINGS",
     "IMAGE_FOLDER",
+    "LABEL_FILES",
     "LANE_FOLDER",
     "DrivingDataset",
     "MixedDataset",
@@ -47,10 +49,18 @@ __all__ = [
     "sampling_weights",
 ]
 
+_LOGGER: Final = logging.getLogger(__name__)
+
 IMAGE_FOLDER: Final = "images"
 DETECTION_FOLDER: Final = "det_annotations"
 DRIVABLE_FOLDER: Final = "da_seg_annotations"
 LANE_FOLDER: Final = "ll_seg_annotations"
+LABEL_FILES: Final[dict[Task, tuple[str, str]]] = {
+    "detection": (DETECTION_FOLDER, ".json"),
+    "drivable": (DRIVABLE_FOLDER, ".png"),
+    "lane": (LANE_FOLDER, ".png"),
+}
+"""Folder and file ending of a task's labels."""
 IMAGE_ENDINGS: Final = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
 
 _IGNORED: Final = 2
@@ -241,14 +251,29 @@ class DrivingDataset:
             raise DataError(f"{name}: not an annotation in the per-image form (attributes are no object)")
         return {str(key): str(value) for key, value in own.items()} | self._extra.get(name, {})
 
+    def label_path(self, task: Task, name: str) -> Path:
+        """Return where an image's labels of a task are, if it has any."""
+        folder, ending = LABEL_FILES[task]
+        return self.root / folder / self.split / f"{name}{ending}"
+
+    def has_labels(self, task: Task) -> bool:
+        """Return whether an image is labelled for a task; looks up to the first."""
+        return task in self._tasks and any(self.label_path(task, name).is_file() for name in self.names)
+
+    def meaning(self, task: Task) -> str:
+        """Return, as text to compare, what the values in a task's labels mean."""
+        about = self.description
+        own: tuple[object, ...] = (about.drivable if task == "drivable" else about.lane,)
+        if task == "detection":
+            own = (self._table, about.ignore)
+        return repr((task in self._tasks, *own, about.ego_mask, sorted(about.ego_masks.items())))
+
     def fingerprint(self, index: int) -> str:
         """Return a hash of a sample's files and of what their values mean; files that are missing are left out."""
         name, about = self.names[index], self.description
         meaning = (self._table, about.ignore, self._tasks, about.drivable, about.lane)
         digest = hashlib.sha256(repr(meaning).encode())
-        labels = ((DETECTION_FOLDER, ".json"), (DRIVABLE_FOLDER, ".png"), (LANE_FOLDER, ".png"))
-        paths = [self.root / folder / self.split / f"{name}{ending}" for folder, ending in labels]
-        for path in (self.image_path(index), *paths):
+        for path in (self.image_path(index), *(self.label_path(task, name) for task in LABEL_FILES)):
             data = _bytes_of(path)
             digest.update(b"-" if data is None else hashlib.sha256(data.tobytes()).digest())
         return digest.hexdigest()[:16]
@@ -309,7 +334,7 @@ class DrivingDataset:
         )
 
     def _annotation(self, name: str) -> Any:
-        path = self.root / DETECTION_FOLDER / self.split / f"{name}.json"
+        path = self.label_path("detection", name)
         data = _bytes_of(path)
         if data is None:
             return None
@@ -323,10 +348,8 @@ class DrivingDataset:
     ) -> tuple[NDArray[np.uint8] | None, NDArray[np.bool_] | None]:
         if task not in self._tasks:
             return None, None
-        folder, meaning = (
-            (DRIVABLE_FOLDER, self.description.drivable) if task == "drivable" else (LANE_FOLDER, self.description.lane)
-        )
-        path = self.root / folder / self.split / f"{name}.png"
+        meaning = self.description.drivable if task == "drivable" else self.description.lane
+        path = self.label_path(task, name)
         data = _bytes_of(path)
         if data is None:
             return None, None
@@ -416,10 +439,14 @@ def sampling_weights(dataset: SampleSource, table: Mapping[str, Mapping[str, flo
             if not factor >= 0:
                 raise DataError(f"sampling weight of {attribute}={value} must not be negative, got {factor}")
     if table:
+        known: set[str] = set()
         for index in range(len(dataset)):
             attributes = dataset.attributes(index)
+            known |= attributes.keys()
             for attribute, factors in table.items():
                 weights[index] *= factors.get(attributes.get(attribute, ""), 1.0)
+        for attribute in sorted(table.keys() - known):
+            _LOGGER.warning("no image has the attribute %r to sample by%s", attribute, did_you_mean(attribute, known))
     if not weights.any():
         raise DataError("every sampling weight is 0")
     return weights
@@ -488,13 +515,21 @@ def read_index(root: Path) -> list[dict[str, Any]]:
     return [{column: row[column] for column in columns} for row in rows]
 
 
-@functools.lru_cache(maxsize=64)
 def _ego_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
     """Return where an image of ``size`` is valid, from a mask of the own car of any size."""
     try:
-        data = np.fromfile(path, np.uint8)
+        return _read_ego_mask(path, path.stat().st_mtime_ns, size)
     except (OSError, ValueError) as error:  # the latter of a path that no system has
+        if isinstance(error, DataError):
+            raise
         raise DataError(f"{path}: the ego mask that dataset.yaml names cannot be read") from error
+
+
+@functools.lru_cache(maxsize=64)
+def _read_ego_mask(path: Path, changed: int, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Read it; the time of its last change tells it from one that was there before."""
+    del changed
+    data = np.fromfile(path, np.uint8)
     own, _ = decode_mask(data, str(path), MaskMeaning(above=0))
     if own.shape != size:
         own = cv2.resize(own, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)

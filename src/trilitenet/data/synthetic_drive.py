@@ -146,12 +146,10 @@ class SyntheticDrive:
         actors: list[_Actor] = []
         width, speed = self._layout.lane_width, self._speed
 
-        def add(
-            d: float, s: float, relative: float, *, wave: float = 0.0, heavy: float = 0.2, until: float = math.inf
-        ) -> None:
+        def add(d: float, s: float, relative: float, *, wave: float = 0.0, heavy: float = 0.2) -> None:
             number = len(actors) + 1
             model = random_vehicle(rng, 0.0, d, 0.0, heavy=heavy, number=number)
-            actors.append(_Actor(model, s, relative, wave, float(rng.uniform(12, 18)), until, speed))
+            actors.append(_Actor(model, s, relative, wave, float(rng.uniform(12, 18)), speed))
 
         # The one ahead: the ego vehicle closes in on it until it changes lanes, and passes it afterwards.
         change = min(self._change_at, self.duration)
@@ -171,9 +169,7 @@ class SyntheticDrive:
             lane = self._layout.oncoming[int(rng.integers(len(self._layout.oncoming)))]
             number = len(actors) + 1
             model = random_vehicle(rng, 0.0, lane, math.pi, heavy=0.25, number=number)
-            actors.append(
-                _Actor(model, 30 + 85.0 * i + float(rng.uniform(-25, 25)), -27.0 - speed, 0.0, 1.0, math.inf, speed)
-            )
+            actors.append(_Actor(model, 30 + 85.0 * i + float(rng.uniform(-25, 25)), -27.0 - speed, 0.0, 1.0, speed))
         return actors
 
 
@@ -181,10 +177,10 @@ class _Actor:
     """Another vehicle: it keeps its lane, and its distance to the ego vehicle changes smoothly."""
 
     def __init__(
-        self, model: Vehicle, start: float, relative: float, wave: float, period: float, until: float, ego_speed: float
+        self, model: Vehicle, start: float, relative: float, wave: float, period: float, ego_speed: float
     ) -> None:
         self.model, self.start, self.relative, self.wave, self.period = model, start, relative, wave, period
-        self.until, self.ego_speed = until, ego_speed
+        self.ego_speed = ego_speed
 
     def __call__(self, time: float) -> Vehicle | None:
         phase = 2 * math.pi * time / self.period

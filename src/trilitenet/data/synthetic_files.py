@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trilitenet.data.description import DESCRIPTION_FILE, DatasetDescription, write_description
+from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, IMAGE_FOLDER, LANE_FOLDER
 from trilitenet.data.sample import Sample
 from trilitenet.data.synthetic import SyntheticScenes
 from trilitenet.errors import ConfigError, OutputError, replacing
@@ -20,7 +21,7 @@ from trilitenet.processing.cores import ProcessPool
 
 __all__ = ["annotation", "write_dataset", "write_sample"]
 
-FOLDERS = ("images", "det_annotations", "da_seg_annotations", "ll_seg_annotations")
+FOLDERS = (IMAGE_FOLDER, DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER)
 
 
 def write_dataset(
@@ -106,13 +107,13 @@ def write_sample(root: Path, split: str, sample: Sample) -> None:
     The image comes last: should the writing end, by a full disk for example, each image that is there has its labels.
     """
     if sample.boxes is not None:
-        with replacing(root / "det_annotations" / split / f"{sample.name}.json") as part:
+        with replacing(root / DETECTION_FOLDER / split / f"{sample.name}.json") as part:
             part.write_text(json.dumps(annotation(sample), separators=(",", ":")), encoding="utf-8")
-    for folder, mask in (("da_seg_annotations", sample.drivable), ("ll_seg_annotations", sample.lane)):
+    for folder, mask in ((DRIVABLE_FOLDER, sample.drivable), (LANE_FOLDER, sample.lane)):
         if mask is not None:
             with replacing(root / folder / split / f"{sample.name}.png") as part:
                 Image.fromarray(_visible(mask)).save(part, format="PNG")
-    with replacing(root / "images" / split / f"{sample.name}.jpg") as part:
+    with replacing(root / IMAGE_FOLDER / split / f"{sample.name}.jpg") as part:
         Image.fromarray(sample.image).save(part, format="JPEG", quality=92)
 
 

@@ -102,8 +102,6 @@ class Lighting:
 
     def __init__(self, world: World) -> None:
         self.light = world.light
-        self.ambient = np.array(self.light.ambient, np.float32)
-        self.haze_colour = np.array(self.light.horizon, np.float32)
 
     def tone(self, colour: Colour, x: float, y: float) -> tuple[float, float, float]:
         """Return the colour that a surface at (x, y) metres shows."""
@@ -119,9 +117,8 @@ class Lighting:
         )
         return red, green, blue
 
-    def lamp_tone(self, colour: Colour, x: float, y: float) -> tuple[float, float, float]:
-        """As `tone`, for what shines by itself."""
-        del y
+    def lamp_tone(self, colour: Colour, x: float) -> tuple[float, float, float]:
+        """As `tone`, for what shines by itself, ``x`` metres ahead."""
         clear = math.exp(-self.light.haze * 0.5 * max(x, 0.0))
         red, green, blue = (c * clear + h * (1 - clear) for c, h in zip(colour, self.light.horizon, strict=True))
         return red, green, blue

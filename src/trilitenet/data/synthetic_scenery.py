@@ -11,21 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.data.synthetic_optics import Lighting, noise
-from trilitenet.data.synthetic_vehicles import Lamp
+from trilitenet.data.synthetic_vehicles import SHIFT, Lamp, fixed
 from trilitenet.data.synthetic_world import FAR, Barrier, Colour, Item, World
 from trilitenet.processing.geometry import Camera
 
-__all__ = ["SCENERY", "SHIFT", "draw_barrier", "draw_item", "fill", "fixed"]
+__all__ = ["SCENERY", "draw_barrier", "draw_item", "fill"]
 
 SCENERY: Final = 1
 """Mark of scenery in the map of objects; 0 is ground or sky."""
-SHIFT: Final = 4
-"""Fractional bits of the coordinates that OpenCV draws at."""
-
-
-def fixed(points: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Return pixels as OpenCV's fixed-point numbers with `SHIFT` fractional bits."""
-    return np.round(np.clip(points, -30000, 30000) * (1 << SHIFT)).astype(np.int32)
 
 
 def fill(image: NDArray[np.uint8], ids: NDArray[np.uint8], pixels: NDArray[np.float64], colour: Colour) -> None:
@@ -152,7 +145,7 @@ def draw_item(
                 image,
                 ids,
                 camera.to_pixels(board),
-                lighting.lamp_tone(tint, x, y),
+                lighting.lamp_tone(tint, x),
             )
     elif item.kind == "pedestrian":
         _draw_person(world, item, x, y, image, ids, lighting)

@@ -17,14 +17,15 @@ from numpy.typing import NDArray
 from trilitenet.data.synthetic_world import Colour, Vehicle
 from trilitenet.processing.geometry import Camera
 
-__all__ = ["SHAPES", "Lamp", "Shape", "VehiclePose", "draw_shadow", "draw_vehicle"]
+__all__ = ["SHAPES", "SHIFT", "Lamp", "Shape", "VehiclePose", "draw_shadow", "draw_vehicle", "fixed"]
 
 Floats = NDArray[np.float64]
 Surface = Literal["body", "glass", "roof", "dark", "cargo"]
 Tone = Callable[[Colour, float, float], tuple[float, float, float]]
 """(colour, x forward in metres, y left in metres) -> colour under the scene's light and haze."""
 
-_SHIFT: Final = 4
+SHIFT: Final = 4
+"""Fractional bits of the coordinates that OpenCV draws at."""
 _LIMIT: Final = 30000.0
 
 
@@ -249,8 +250,9 @@ class VehiclePose:
         return self.place(np.array([[0, -half, 0], [0, half, 0], [length, half, 0], [length, -half, 0]], np.float64))
 
 
-def _fixed(points: Floats) -> NDArray[np.int32]:
-    return np.round(np.clip(points, -_LIMIT, _LIMIT) * (1 << _SHIFT)).astype(np.int32)
+def fixed(points: Floats) -> NDArray[np.int32]:
+    """Return pixels as OpenCV's fixed-point numbers with `SHIFT` fractional bits."""
+    return np.round(np.clip(points, -_LIMIT, _LIMIT) * (1 << SHIFT)).astype(np.int32)
 
 
 def draw_shadow(image: NDArray[np.uint8], camera: Camera, pose: VehiclePose, depth: float) -> None:
@@ -278,7 +280,7 @@ def draw_shadow(image: NDArray[np.uint8], camera: Camera, pose: VehiclePose, dep
         region = image[top:bottom, left:right]
         mask = np.full(region.shape[:2], 255, np.uint8)
         level = int(255 * (1 - depth * share))
-        cv2.fillPoly(mask, [_fixed(pixels - (left, top))], level, cv2.LINE_AA, _SHIFT)
+        cv2.fillPoly(mask, [fixed(pixels - (left, top))], level, cv2.LINE_AA, SHIFT)
         if grow > 1.1 and min(bottom - top, right - left) > 4:
             size = max(3, (bottom - top) // 4 | 1)
             mask = np.asarray(cv2.blur(mask, (size, size)), np.uint8)
@@ -308,11 +310,11 @@ class _Pen:
         depth = seen[:, 2]
         if depth.min() < 0.3:
             return
-        fixed = (np.clip(seen[:, :2] / depth[:, None], -_LIMIT, _LIMIT) * (1 << _SHIFT) + 0.5).astype(np.int32)
+        outline = (np.clip(seen[:, :2] / depth[:, None], -_LIMIT, _LIMIT) * (1 << SHIFT) + 0.5).astype(np.int32)
         shade = tuple(b + g * c * gain for b, g, c in zip(self.base, self.gain, colour, strict=True))
-        cv2.fillPoly(self.image, [fixed], shade, cv2.LINE_AA, _SHIFT)
+        cv2.fillPoly(self.image, [outline], shade, cv2.LINE_AA, SHIFT)
         if mark:
-            cv2.fillPoly(self.ids, [fixed], self.number, cv2.LINE_8, _SHIFT)
+            cv2.fillPoly(self.ids, [outline], self.number, cv2.LINE_8, SHIFT)
 
 
 _GLASS: Final[Colour] = (42.0, 50.0, 58.0)

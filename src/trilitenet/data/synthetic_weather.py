@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.data.synthetic_optics import TILE, Plane
-from trilitenet.data.synthetic_scenery import SHIFT, fill, fixed
-from trilitenet.data.synthetic_vehicles import Lamp
+from trilitenet.data.synthetic_scenery import fill
+from trilitenet.data.synthetic_vehicles import SHIFT, Lamp, fixed
 from trilitenet.data.synthetic_world import World
 
 __all__ = ["add_camera_faults", "draw_bonnet", "draw_glare", "draw_rain", "draw_reflections"]

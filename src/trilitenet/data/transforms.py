@@ -10,6 +10,7 @@ are moved by half a pixel before and after.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Final, Protocol
 
@@ -110,8 +111,8 @@ class Augmentation:
         if not 0 <= self.mask_above < 255:
             raise ConfigError(f"mask_above must be in [0, 255), got {self.mask_above}")
         for name in ("rotation", "translation", "hue", "saturation", "value"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ConfigError(f"{name} must not be negative or infinite, got {getattr(self, name)}")
         for name in ("flip", *_PHOTOMETRIC, "mosaic", "mixup"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"{name} is a probability, in [0, 1], got {getattr(self, name)}")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from trilitenet.config import STRIDES, Anchors
 from trilitenet.data.reading import SampleSource
 from trilitenet.errors import DataError, import_extra
+from trilitenet.processing.boxes import best_side_ratio
 from trilitenet.processing.letterbox import Letterbox
 
 __all__ = ["AnchorFit", "best_possible_recall", "box_sizes", "fit_anchors"]
@@ -76,13 +77,6 @@ def box_sizes(
     return np.concatenate(sizes)
 
 
-def _worst_ratio(sizes: NDArray[np.float64], anchors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N,) the best anchor's worst side ratio, in (0, 1]."""
-    ratio = sizes[:, None] / anchors[None]
-    worst: NDArray[np.float64] = np.minimum(ratio, 1 / ratio).min(axis=2).max(axis=1)
-    return worst
-
-
 def best_possible_recall(sizes: NDArray[np.float64], anchors: NDArray[np.float64], ratio_limit: float = 4.0) -> float:
     """Return the share of boxes that at least one anchor takes.
 
@@ -91,7 +85,7 @@ def best_possible_recall(sizes: NDArray[np.float64], anchors: NDArray[np.float64
         anchors: (A, 2) width and height in the same unit.
         ratio_limit: See `trilitenet.losses.detection.match`.
     """
-    return float((_worst_ratio(sizes, anchors) > 1 / ratio_limit).mean())
+    return float((best_side_ratio(sizes, anchors) > 1 / ratio_limit).mean())
 
 
 def fit_anchors(
@@ -130,7 +124,9 @@ def fit_anchors(
         centres = np.concatenate([centres, np.log(extra)])
     new = np.exp(centres)
     new = np.round(new[np.argsort(new.prod(axis=1))], 1)
-    scores = [(best_possible_recall(sizes, a, ratio_limit), float(_worst_ratio(sizes, a).mean())) for a in (old, new)]
+    scores = [
+        (best_possible_recall(sizes, a, ratio_limit), float(best_side_ratio(sizes, a).mean())) for a in (old, new)
+    ]
     changed = scores[0][0] < enough and scores[1][1] > scores[0][1] and scores[1][0] >= scores[0][0] - 1e-3
     chosen = new if changed else old
     anchors = tuple(

@@ -19,7 +19,7 @@ from trilitenet.engine.figures import HEADLINES, meaning
 from trilitenet.engine.page import escape, interval_plot, page, percent, section, table
 from trilitenet.engine.published_rows import PUBLISHED_ROWS, PublishedRow
 from trilitenet.engine.report import Report, render
-from trilitenet.errors import ConfigError, writing
+from trilitenet.errors import ConfigError, write_file
 from trilitenet.metrics.bootstrap import bootstrap, interval
 
 __all__ = ["COMPARISON_SCHEMA", "Comparison", "Difference", "compare_reports"]
@@ -60,6 +60,7 @@ class Comparison:
         figures: Name -> figure key -> value.
         differences: Of every other model to the first; none for those measured on other images.
         unpaired: Name -> why its differences cannot be told.
+        confidence: Name -> the confidence that precision, recall and F1 of boxes are stated at.
         published: Published rows beside them.
         resamples: Bootstrap draws.
     """
@@ -69,6 +70,7 @@ class Comparison:
     figures: dict[str, dict[str, float]]
     differences: tuple[Difference, ...]
     unpaired: dict[str, str]
+    confidence: dict[str, float]
     published: tuple[PublishedRow, ...]
     resamples: int
 
@@ -88,6 +90,7 @@ class Comparison:
                 for one in self.differences
             ],
             "unpaired": self.unpaired,
+            "confidence": self.confidence,
             "published": [dataclasses.asdict(row) for row in self.published],
             "resamples": self.resamples,
         }
@@ -98,11 +101,9 @@ class Comparison:
         Raises:
             OutputError: If they cannot be written.
         """
-        with writing(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-            text = json.dumps(self.to_dict(), ensure_ascii=False, indent=1) + "\n"
-            (folder / "comparison.json").write_text(text, encoding="utf-8")
-            (folder / "comparison.html").write_text(_comparison_page(self), encoding="utf-8")
+        text = json.dumps(self.to_dict(), ensure_ascii=False, indent=1) + "\n"
+        write_file(folder / "comparison.json", text)
+        write_file(folder / "comparison.html", _comparison_page(self))
 
     def summary(self) -> str:
         """Return the comparison as text for a terminal."""
@@ -111,9 +112,18 @@ class Comparison:
             Text("* differs from the first: the 95% interval of the paired difference leaves out 0", style="dim")
         )
         parts += [Text(f"{name}: {reason}") for name, reason in self.unpaired.items()]
+        if note := self.confidence_note():
+            parts.append(Text(note))
         if self.published:
             parts += _published_table(self)
         return render(parts)
+
+    def confidence_note(self) -> str:
+        """Return at which confidence each model's precision, recall and F1 are, where it is not the same for all."""
+        if len(set(self.confidence.values())) < 2:
+            return ""
+        told = ", ".join(f"{name} {value:.3g}" for name, value in self.confidence.items())
+        return f"detection precision, recall and F1 are stated at other confidences: {told}"
 
     def difference(self, name: str, key: str) -> Difference | None:
         """Return the difference of a model in a figure, if it could be told."""
@@ -164,6 +174,11 @@ def compare_reports(
         },
         differences=tuple(differences),
         unpaired=unpaired,
+        confidence={
+            name: report.provenance.thresholds["confidence"]
+            for name, report in reports.items()
+            if "confidence" in report.provenance.thresholds
+        },
         published=PUBLISHED_ROWS if published else (),
         resamples=resamples,
     )
@@ -264,6 +279,8 @@ def _comparison_page(comparison: Comparison) -> str:
             else f'<p class="note">{escape(comparison.unpaired.get(name, "no figure in common"))}</p>'
         )
         plots.append(f'<div class="card"><h3>{escape(name)} less {escape(names[0])}, points</h3>{body}</div>')
+    if note := comparison.confidence_note():
+        plots.append(f'<p class="note">{escape(note)}</p>')
     if plots:
         parts.append(section("Which differences are real", f'<div class="grid">{"".join(plots)}</div>'))
     parts.append(section("Every figure", f'<div class="card">{_page_figures(comparison)}</div>', "Per cent."))

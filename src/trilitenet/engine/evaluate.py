@@ -247,7 +247,7 @@ def score_predictions(
             perception if "fair" in protocols else None,
             _saved_on_canvas(perception, letterbox) if "paper" in protocols else None,
         )
-    if predictions.names and not known:
+    if predictions.names and not known and count == len(dataset):
         raise DataError(
             f"{predictions.folder}: predictions for none of the {count} images "
             f"(such as {min(predictions.names)!r}); image_id must be the name of the image without ending"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from typing import Final
 
 import torch
@@ -23,17 +24,18 @@ class FiniteGuard:
 
     Whether a step was bad is a tensor on the device, read once in ``interval`` steps, so that a GPU is not waited for;
     until then the fused optimiser itself leaves out bad steps (``found_inf``). A bad step's forward pass also spoils
-    the running statistics of batch normalisation: they are put back to what they were when last found good.
+    the running statistics of batch normalisation, and those of a moving average that follows: they are put back to what
+    they were when last found good.
 
     Args:
-        network: Whose buffers are kept.
+        networks: Whose buffers are kept: what is trained, and what follows it.
         optimiser: A fused one if ``interval`` is above 1.
         interval: Steps between looks.
     """
 
-    def __init__(self, network: nn.Module, optimiser: torch.optim.Optimizer, interval: int = 1) -> None:
+    def __init__(self, networks: Sequence[nn.Module], optimiser: torch.optim.Optimizer, interval: int = 1) -> None:
         self.bad_steps = 0
-        self._buffers = list(network.buffers())
+        self._buffers = [buffer for network in networks for buffer in network.buffers()]
         self._kept = [buffer.clone() for buffer in self._buffers]
         self._optimiser = optimiser
         self._interval = interval

@@ -28,6 +28,12 @@ __all__ = ["Lessons", "TaughtTransform"]
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _HALF: Final = 127
+_FIELDS: Final[dict[Task, tuple[str, ...]]] = {
+    "detection": ("boxes", "class_id"),
+    "drivable": ("drivable",),
+    "lane": ("lane",),
+}
+"""What a sample holds of a task."""
 """An area-resized mask pixel (0 to 255) above this is foreground, which keeps a mask's area."""
 
 
@@ -72,8 +78,12 @@ class Lessons:
         masks = (path.stem for task in ("drivable", "lane") for path in (self._saved.folder / task).glob("*.png"))
         return self._saved.names | set(masks)
 
-    def of(self, sample: Sample) -> Sample | None:
+    def of(self, sample: Sample, wanted: Sequence[Task] = TASKS) -> Sample | None:
         """Return the sample with the teacher's outputs as its only labels; None if the teacher never saw it.
+
+        Args:
+            sample: The sample.
+            wanted: Tasks whose outputs are read; of others there are none.
 
         Raises:
             DataError: If a mask is missing beside another, broken, or of another shape than the image.
@@ -88,7 +98,7 @@ class Lessons:
             raise DataError(
                 f"{seen[0]}: {size[1]}x{size[0]}, of another shape than the image of {sample.size[1]}x{sample.size[0]}"
             )
-        said = self._saved.get(sample.name, size)
+        said = self._saved.get(sample.name, size, wanted)
         boxes, class_id, doubtful = self._boxes(said, (sample.size[0] / size[0], sample.size[1] / size[1]))
         return dataclasses.replace(
             sample,
@@ -145,16 +155,17 @@ class TaughtTransform:
 
     def _taught(self, sample: Sample, rng: np.random.Generator) -> Sample:
         draws = rng.random(len(TASKS))
-        lesson = self.lessons.of(sample)
+        wanted: list[Task] = []
+        for task, weight, drawn in zip(TASKS, self.weights, draws, strict=True):
+            labelled = getattr(sample, _FIELDS[task][0]) is not None
+            if task in self.lessons.tasks and weight and not (labelled and drawn >= weight / (1 + weight)):
+                wanted.append(task)
+        lesson = self.lessons.of(sample, wanted) if wanted else None
         if lesson is None:
             return sample
         taken: dict[str, Any] = {}
-        for task, weight, drawn in zip(TASKS, self.weights, draws, strict=True):
-            fields = ("boxes", "class_id") if task == "detection" else (task,)
-            labelled = getattr(sample, fields[0]) is not None
-            if task not in self.lessons.tasks or not weight or (labelled and drawn >= weight / (1 + weight)):
-                continue
-            taken |= {name: getattr(lesson, name) for name in fields}
+        for task in wanted:
+            taken |= {name: getattr(lesson, name) for name in _FIELDS[task]}
             if task == "detection":
                 taken["ignored"] = np.concatenate([sample.ignored, lesson.ignored])
         return dataclasses.replace(sample, **taken)

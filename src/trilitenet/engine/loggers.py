@@ -6,11 +6,19 @@ import contextlib
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from trilitenet.errors import import_extra, replacing
 
-__all__ = ["CsvLogger", "MLflowLogger", "RunLogger", "TensorBoardLogger", "WandbLogger", "build_loggers"]
+__all__ = [
+    "CsvLogger",
+    "MLflowLogger",
+    "RunLogger",
+    "TensorBoardLogger",
+    "WandbLogger",
+    "build_loggers",
+    "check_loggers",
+]
 
 
 class RunLogger(Protocol):
@@ -70,7 +78,7 @@ class TensorBoardLogger:
     """
 
     def __init__(self, folder: Path, step: int = 0) -> None:
-        module: Any = import_extra("torch.utils.tensorboard", "train")
+        module: Any = import_extra(*_PACKAGES["tensorboard"])
         self._writer = module.SummaryWriter(str(folder), purge_step=step + 1 if step else None)
 
     def log(self, values: Mapping[str, float], step: int) -> None:
@@ -87,7 +95,7 @@ class MLflowLogger:
     """An MLflow run, at the tracking server that MLFLOW_TRACKING_URI names."""
 
     def __init__(self, name: str, config: Mapping[str, Any]) -> None:
-        self._mlflow: Any = import_extra("mlflow", "mlflow")
+        self._mlflow: Any = import_extra(*_PACKAGES["mlflow"])
         self._mlflow.start_run(run_name=name)
         self._mlflow.log_params({key: str(value)[:250] for key, value in config.items()})
 
@@ -104,7 +112,7 @@ class WandbLogger:
     """A Weights & Biases run; WANDB_MODE=offline keeps it on this machine."""
 
     def __init__(self, name: str, config: Mapping[str, Any], folder: Path) -> None:
-        wandb: Any = import_extra("wandb", "wandb")
+        wandb: Any = import_extra(*_PACKAGES["wandb"])
         self._run = wandb.init(project="trilitenet", name=name, config=dict(config), dir=str(folder))
 
     def log(self, values: Mapping[str, float], step: int) -> None:
@@ -114,6 +122,25 @@ class WandbLogger:
     def close(self) -> None:
         """End the run."""
         self._run.finish()
+
+
+_PACKAGES: Final = {
+    "tensorboard": ("torch.utils.tensorboard", "train"),
+    "mlflow": ("mlflow", "mlflow"),
+    "wandb": ("wandb", "wandb"),
+}
+"""What a logger needs, and the extra that installs it."""
+
+
+def check_loggers(names: Sequence[str]) -> None:
+    """Refuse loggers whose package is not installed, before anything is written.
+
+    Raises:
+        MissingExtraError: If one is not.
+    """
+    for name in names:
+        if name in _PACKAGES:
+            import_extra(*_PACKAGES[name])
 
 
 def build_loggers(names: Sequence[str], folder: Path, config: Mapping[str, Any], step: int = 0) -> list[RunLogger]:

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import Task
-from trilitenet.engine.scoring import LabelledImage
-from trilitenet.metrics.arithmetic import box_cover, box_overlap
-from trilitenet.structures import Perception
+from trilitenet.engine.scoring import LabelledImage, on_own_car
+from trilitenet.metrics.detection import in_regions, match_boxes
+from trilitenet.structures import Boxes, Perception
 
 __all__ = ["FALSE", "IGNORED", "MISSED", "RIGHT", "error_overlay", "shrunken"]
 
@@ -92,24 +92,27 @@ def _draw_masks(picture: NDArray[np.uint8], predicted: NDArray[Any], true: NDArr
 def _draw_boxes(
     picture: NDArray[np.uint8], sample: LabelledImage, prediction: Perception, confidence: float, scale: float
 ) -> None:
-    truth = np.zeros((0, 4)) if sample.boxes is None else np.asarray(sample.boxes, np.float64)
-    regions = np.asarray(sample.ignored, np.float64)
-    boxes = np.zeros((0, 4))
-    if prediction.boxes is not None:
-        boxes = np.asarray(prediction.boxes.xyxy[prediction.boxes.confidence > confidence], np.float64)
-    overlap = box_overlap(boxes, truth)
-    found = np.zeros(len(truth), np.bool_)
-    for region in regions:
+    found, predicted = Boxes.empty(), prediction.boxes
+    if predicted is not None:
+        best = np.argsort(-predicted.confidence, kind="stable")
+        found = predicted.select(best[predicted.confidence[best] > confidence])
+    truth, classes = np.zeros((0, 4)), np.zeros(0, np.int64)
+    if sample.boxes is not None and sample.class_id is not None:
+        truth, classes = np.asarray(sample.boxes, np.float64), sample.class_id
+    target = match_boxes(found.xyxy, found.class_id, truth, classes)
+    right = target >= 0
+    right[right] = classes[target[right]] == found.class_id[right]
+    excused = in_regions(found.xyxy, sample.ignored)
+    if sample.valid is not None and len(found):
+        excused |= on_own_car(sample.valid, found.xyxy)
+    for region in np.asarray(sample.ignored, np.float64):
         _rectangle(picture, region, scale, IGNORED)
-    for row, box in enumerate(boxes):
-        reach = np.where(found, -1.0, overlap[row])
-        if len(reach) and reach.max() >= 0.5:
-            found[reach.argmax()] = True
-            _rectangle(picture, box, scale, RIGHT)
-        elif not (box_cover(box[None], regions) >= 0.5).any():
-            _rectangle(picture, box, scale, FALSE)
-    for box in truth[~found]:
+    for box in np.delete(truth, target[right], axis=0):
         _rectangle(picture, box, scale, MISSED)
+    for box in found.xyxy[~right & ((target >= 0) | ~excused)]:
+        _rectangle(picture, box, scale, FALSE)
+    for box in found.xyxy[right]:
+        _rectangle(picture, box, scale, RIGHT)
 
 
 def _rectangle(picture: NDArray[np.uint8], box: NDArray[Any], scale: float, colour: tuple[int, int, int]) -> None:

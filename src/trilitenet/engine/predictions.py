@@ -13,7 +13,9 @@ an image without a mask, where others have one, is an error.
 from __future__ import annotations
 
 import array
+import contextlib
 import json
+import math
 import re
 import shutil
 from collections.abc import Iterator, Sequence
@@ -26,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import TASKS, Task
-from trilitenet.errors import DataError, OutputError, brief, writing
+from trilitenet.errors import DataError, OutputError, brief, part_of, writing
 from trilitenet.structures import Boxes, Perception
 
 __all__ = ["DETECTIONS_FILE", "PredictionWriter", "SavedPredictions"]
@@ -65,7 +67,7 @@ class PredictionWriter:
                 if task != "detection":
                     (folder / task).mkdir(exist_ok=True)
             if "detection" in self._tasks:
-                self._file = (folder / DETECTIONS_FILE).open("w", encoding="utf-8")
+                self._file = part_of(folder / DETECTIONS_FILE).open("w", encoding="utf-8")
                 self._file.write("[")
 
     def __enter__(self) -> PredictionWriter:
@@ -74,7 +76,13 @@ class PredictionWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        if error is None:
+            self.close()
+        elif self._file is not None:  # without its other images it would say that they are empty
+            with contextlib.suppress(OSError):
+                self._file.close()
+            part_of(self.folder / DETECTIONS_FILE).unlink(missing_ok=True)
+            self._file = None
 
     def write(self, name: str, prediction: Perception) -> None:
         """Add the prediction for an image.
@@ -92,7 +100,8 @@ class PredictionWriter:
                     "bbox": [round(value, 3) for value in (left, top, right - left, bottom - top)],
                     "score": float(f"{score:.7g}"),
                 }
-                self._file.write(("\n" if self._first else ",\n") + json.dumps(entry))
+                with writing(self.folder / DETECTIONS_FILE):
+                    self._file.write(("\n" if self._first else ",\n") + json.dumps(entry))
                 self._first = False
         for task in self._tasks:
             mask: NDArray[np.bool_] | None = getattr(prediction, task, None) if task != "detection" else None
@@ -103,11 +112,18 @@ class PredictionWriter:
                     path.write_bytes(bytes(np.asarray(encoded, np.uint8)))
 
     def close(self) -> None:
-        """Finish ``detections.json``. Calling it twice is harmless."""
+        """Finish ``detections.json``, which has its name from then on. Calling it twice is harmless.
+
+        Raises:
+            OutputError: If it cannot be written.
+        """
         if self._file is not None:
-            self._file.write("\n]\n")
-            self._file.close()
-            self._file = None
+            path = self.folder / DETECTIONS_FILE
+            with writing(path):
+                with self._file as file:
+                    self._file = None
+                    file.write("\n]\n")
+                part_of(path).replace(path)
 
 
 class SavedPredictions:
@@ -141,28 +157,28 @@ class SavedPredictions:
         """Images that have boxes."""
         return set(self._boxes)
 
-    def get(self, name: str, size: tuple[int, int]) -> Perception:
+    def get(self, name: str, size: tuple[int, int], tasks: Sequence[Task] = TASKS) -> Perception:
         """Return the prediction for an image.
 
         Args:
             name: Of the image, without ending.
             size: (height, width) of the image.
+            tasks: What of it is read; nothing is said of others.
 
         Raises:
             DataError: If a mask is missing, broken or of another size.
         """
-        boxes = self._boxes.get(name, Boxes.empty()) if "detection" in self.tasks else None
+        present = set(tasks) & set(self.tasks)
+        boxes = self._boxes.get(name, Boxes.empty()) if "detection" in present else None
         return Perception(
             size=size,
             class_names=self.class_names,
             boxes=boxes,
-            drivable=self._mask("drivable", name, size),
-            lane=self._mask("lane", name, size),
+            drivable=self._mask("drivable", name, size) if "drivable" in present else None,
+            lane=self._mask("lane", name, size) if "lane" in present else None,
         )
 
-    def _mask(self, task: Task, name: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
-        if task not in self.tasks:
-            return None
+    def _mask(self, task: Task, name: str, size: tuple[int, int]) -> NDArray[np.bool_]:
         path = self.folder / task / f"{name}.png"
         if not path.is_file():
             raise DataError(f"{path}: missing; every image needs a mask (an empty one where nothing is predicted)")
@@ -181,6 +197,8 @@ class SavedPredictions:
             for entry in _entries(path.read_text(encoding="utf-8")):
                 left, top, width, height = (float(value) for value in entry["bbox"])
                 number = self._class(int(entry["category_id"]), path)
+                if not all(map(math.isfinite, (left, top, width, height))):
+                    raise DataError(f"{path}: a bbox must be four numbers, got {entry['bbox']}")
                 score = float(entry["score"])
                 if not 0 <= score <= 1:
                     raise DataError(f"{path}: a score must be between 0 and 1, got {score}")

@@ -162,6 +162,8 @@ class TrainConfig:
             "warmup_epochs",
             "warmup_steps",
             "clip_gradient",
+            "final_lr",
+            "ema_ramp",
             "workers",
             "max_steps",
             "patience",
@@ -174,16 +176,17 @@ class TrainConfig:
             raise ConfigError(f"seed must be below 2**63, got {self.seed}")
         if self.batch_size % self.accumulate:
             raise ConfigError(f"batch_size {self.batch_size} is not a multiple of accumulate {self.accumulate}")
-        if self.multi_scale is not None and not 0 < self.multi_scale[0] <= self.multi_scale[1]:
+        if self.multi_scale is not None and not 0 < self.multi_scale[0] <= self.multi_scale[1] < math.inf:
             raise ConfigError(f"multi_scale must be two factors, the lower first, got {self.multi_scale}")
-        if not all(weight >= 0 for weight in self.distillation):
-            raise ConfigError(f"distillation's weights must not be negative, got {self.distillation}")
+        for name in ("task_weights", "box_gains", "drivable_tversky", "lane_tversky", "focal", "distillation"):
+            if not all(0 <= value < math.inf for value in getattr(self, name)):
+                raise ConfigError(f"{name} must not hold negative or infinite numbers, got {getattr(self, name)}")
         if not 0 <= self.teacher_confidence[0] <= self.teacher_confidence[1] <= 1:
             raise ConfigError(
                 f"teacher_confidence must be two numbers in [0, 1], the lower first, got {self.teacher_confidence}"
             )
-        if not self.lr > 0:
-            raise ConfigError(f"lr must be above 0, got {self.lr}")
+        if not 0 < self.lr < math.inf:
+            raise ConfigError(f"lr must be above 0 and not infinite, got {self.lr}")
         if not all(0 <= beta < 1 for beta in self.betas):
             raise ConfigError(f"betas must be in [0, 1), got {self.betas}")
         if self.anchors is not None:

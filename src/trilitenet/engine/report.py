@@ -20,7 +20,7 @@ from rich.text import Text
 from trilitenet.engine.figures import CONDITION_FIGURES, HEADLINES, meaning
 from trilitenet.engine.page import percent
 from trilitenet.engine.scoring import FairMetrics, FairScores, PaperMetrics, PaperScores
-from trilitenet.errors import DataError, brief, writing
+from trilitenet.errors import DataError, brief, write_file
 
 __all__ = [
     "FEW_IMAGES",
@@ -243,7 +243,7 @@ class Report:
         Raises:
             OutputError: If it cannot be written.
         """
-        _write(path, json.dumps(self.to_dict(), ensure_ascii=False, separators=(",", ":")) + "\n")
+        write_file(path, json.dumps(self.to_dict(), ensure_ascii=False, separators=(",", ":")) + "\n")
 
     def save_html(self, path: Path) -> None:
         """Write one self-contained HTML page.
@@ -253,7 +253,7 @@ class Report:
         """
         from trilitenet.engine.report_html import report_page
 
-        _write(path, report_page(self))
+        write_file(path, report_page(self))
 
     def summary(self) -> str:
         """Return the report as text for a terminal: every figure with its interval and formula, then conditions."""
@@ -366,7 +366,7 @@ def _exclusions(report: Report) -> Text:
 
 
 def read_report(path: Path) -> Report:
-    """Read what `Report.save_json` wrote (without scores as dataclasses and without pictures).
+    """Read what `Report.save_json` wrote (without pictures).
 
     Raises:
         DataError: If it is no report, or a newer one.
@@ -449,9 +449,3 @@ def _without_nan(value: Any) -> Any:
             return list(value)
         return [_without_nan(item) for item in value]
     return value
-
-
-def _write(path: Path, text: str) -> None:
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trilitenet.engine.loggers import read_csv
-from trilitenet.errors import import_extra
+from trilitenet.errors import import_extra, write_file
 
 __all__ = ["write_results"]
 
@@ -73,11 +73,11 @@ def write_results(
         )
     rows = "".join(f"<tr><th>{html.escape(key)}</th><td>{html.escape(value)}</td></tr>" for key, value in facts.items())
     page = folder / "index.html"
-    page.write_text(
+    write_file(
+        page,
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
         f"<style>{_STYLE}</style><h1>{html.escape(title)}</h1><table>{rows}</table>{''.join(figures)}"
         f"{'<h2>Labels and predictions</h2>' if pairs else ''}{''.join(pairs)}</html>\n",
-        encoding="utf-8",
     )
     return page
 

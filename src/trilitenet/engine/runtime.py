@@ -157,7 +157,7 @@ def _build_fabric(device: str, precision: str, devices: int, num_nodes: int) -> 
     picked = pick_precision(precision, accelerator)
     try:
         fabric = lightning.Fabric(accelerator=accelerator, precision=picked, **settings)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, ImportError) as error:  # the last of a device whose package is not here
         raise ConfigError(f"device {device!r} with precision {precision!r}: {error}") from error
     if _emulates(picked, accelerator) and fabric.global_rank == 0:
         log.warning("this processor has no instructions for bf16: --precision 32-true is many times as fast")

@@ -33,6 +33,7 @@ __all__ = [
     "PaperMetrics",
     "PaperScores",
     "add_boxes",
+    "on_own_car",
 ]
 
 
@@ -74,11 +75,11 @@ def add_boxes(metric: DetectionMetric, sample: LabelledImage, boxes: Boxes | Non
     labels = sample.boxes, sample.class_id, sample.ignored
     if boxes is None:
         return metric.update(None, None, None, *labels)
-    neutral = None if sample.valid is None or not len(boxes) else _on_own_car(sample.valid, boxes.xyxy)
+    neutral = None if sample.valid is None or not len(boxes) else on_own_car(sample.valid, boxes.xyxy)
     return metric.update(boxes.xyxy, boxes.confidence, boxes.class_id, *labels, neutral)
 
 
-def _on_own_car(valid: NDArray[np.bool_], boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
+def on_own_car(valid: NDArray[np.bool_], boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return which (D, 4) xyxy px boxes lie by more than half where (H, W) ``valid`` is False."""
     sums = cv2.integral((~valid).view(np.uint8))
     height, width = valid.shape

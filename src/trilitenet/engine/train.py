@@ -29,7 +29,7 @@ from trilitenet.engine.recipe import TrainConfig
 from trilitenet.engine.rescale import draw_size, rescale
 from trilitenet.engine.runtime import RESUME, StopRequest
 from trilitenet.engine.transfer import keep_frozen
-from trilitenet.errors import ConfigError, DataError, TrainingError, WeightsError, brief, writing
+from trilitenet.errors import ConfigError, DataError, TrainingError, WeightsError, brief, write_file, writing
 from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.losses.multitask import LossTerms, MultiTaskLoss
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
@@ -48,7 +48,21 @@ _TRACES: Final = ("config.yaml", "metrics.csv", "results", "tensorboard")
 FIGURES: Final = {"detection": "detection/ap50", "drivable": "drivable/miou", "lane": "lane/iou"}
 """The figure each task is judged by; the mean of these is the overall one."""
 
-SAME_ON_RESUME: Final = ("variant", "tasks", "pcaa", "litepan", "spp", "batch_size", "accumulate", "balancing")
+GUARD_INTERVAL: Final = 20
+"""On a GPU, so many steps pass between two looks at whether they were finite."""
+
+SAME_ON_RESUME: Final = (
+    "variant",
+    "tasks",
+    "pcaa",
+    "litepan",
+    "spp",
+    "batch_size",
+    "accumulate",
+    "balancing",
+    "freeze",  # with `decay_all` it says which parameters the optimiser's state is of, which goes by their place
+    "decay_all",
+)
 """Settings that a checkpoint must share with the run that resumes it."""
 
 
@@ -176,7 +190,10 @@ class Trainer:
         self.loss = loss
         self.teacher = teacher and tuple(part.to(fabric.device).eval() for part in teacher)
         self.ema = MovingAverage(self.network, config.ema_decay, config.ema_ramp) if config.ema_decay else None
-        self.guard = FiniteGuard(self.network, optimiser, 20 if fabric.device.type == "cuda" else 1)
+        followers = [] if self.ema is None else [self.ema.network]
+        self.guard = FiniteGuard(
+            [self.network, *followers], optimiser, GUARD_INTERVAL if fabric.device.type == "cuda" else 1
+        )
 
         self.epoch_steps = len(loader) // config.accumulate
         if not self.epoch_steps:
@@ -223,8 +240,7 @@ class Trainer:
             with writing(self.folder):
                 if resume is None:
                     _forget(self.folder)
-                self.folder.mkdir(parents=True, exist_ok=True)
-                (self.folder / "config.yaml").write_text(yaml.safe_dump(self.config.to_dict(), sort_keys=False))
+            write_file(self.folder / "config.yaml", yaml.safe_dump(self.config.to_dict(), sort_keys=False))
             self.loggers = build_loggers(self.step)
         try:
             finished = self._run()
@@ -287,13 +303,14 @@ class Trainer:
             self.step += 1
             since += sum(len(batch) for batch in group) * self.fabric.world_size
             stopped = self._stopped(stop)
-            if self.step % self.config.log_every == 0 or self.step >= self.steps or stopped:
+            last = self.step >= self.steps or self.step % self.epoch_steps == 0
+            if self.step % self.config.log_every == 0 or last or stopped:
                 elapsed = time.perf_counter() - mark
                 self.seconds, self.images = self.seconds + elapsed, self.images + since
                 self._log_losses(epoch, sums, rate, since / elapsed)
                 sums.zero_()
                 mark, since = time.perf_counter(), 0
-                stopped = self._stopped(stop)
+                stopped = self._stopped(stop)  # the wish may have come while that was told
             if self.step >= self.steps or stopped:
                 break
         self.guard.look()
@@ -314,7 +331,8 @@ class Trainer:
         )
         total = sums[0] if self.fabric.world_size == 1 else self.fabric.all_reduce(sums[0])
         names = tuple(name for batch in batches for name in batch.names)
-        scaled = self.config.precision == "16-mixed"  # its scaler must see bad steps, and leaves them out itself
+        # A gradient scaler must see bad steps, and leaves them out itself.
+        scaled = getattr(self.fabric._precision, "scaler", None) is not None
         if self.guard.good(self.step, names, total, norm) or scaled:
             self.optimiser.step()
             if self.ema is not None:

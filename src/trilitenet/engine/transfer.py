@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Final
 
 import torch
 from torch import nn
@@ -11,6 +12,10 @@ from torch import nn
 from trilitenet.errors import ConfigError, did_you_mean
 
 __all__ = ["TransferReport", "freeze", "initialise", "keep_frozen"]
+
+
+LEAST_SHARE: Final = 0.25
+"""Initial weights that fit less of a network than this are another's: what they have in common is chance."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +49,7 @@ def initialise(network: nn.Module, source: nn.Module) -> TransferReport:
     """Take over from ``source`` every tensor that fits by name and shape.
 
     Raises:
-        ConfigError: If nothing fits.
+        ConfigError: If less than `LEAST_SHARE` of the network's parameters would be taken over; nothing is then.
     """
     ours, theirs = network.state_dict(), source.state_dict()
     loaded, misshapen, missing = [], [], []
@@ -54,10 +59,15 @@ def initialise(network: nn.Module, source: nn.Module) -> TransferReport:
         elif theirs[name].shape != tensor.shape:
             misshapen.append(name)
         else:
-            tensor.copy_(theirs[name])
             loaded.append(name)
-    if not loaded:
-        raise ConfigError("no tensor of the initial weights fits this network; is it another variant?")
+    sizes = {name: parameter.numel() for name, parameter in network.named_parameters()}
+    fitting, total = sum(sizes.get(name, 0) for name in loaded), sum(sizes.values())
+    if fitting < LEAST_SHARE * total:
+        raise ConfigError(
+            f"{fitting:,} of {total:,} parameters of the initial weights fit this network; are they of another variant?"
+        )
+    for name in loaded:
+        ours[name].copy_(theirs[name])
     surplus = [name for name in theirs if name not in ours]
     return TransferReport(tuple(loaded), tuple(misshapen), tuple(missing), tuple(surplus))
 

@@ -2,7 +2,7 @@
 
 The paper names the terms and their weights; matching, the objectness target and the weights a level are those of the
 published code. Everything is vectorised over targets, with shapes that depend on the number of targets alone, so that
-nothing waits for the device.
+nothing waits for what the device computes.
 """
 
 from __future__ import annotations
@@ -67,14 +67,12 @@ def match(boxes: Tensor, anchors: Tensor, grid: tuple[int, int], ratio_limit: fl
         grid: Rows and columns of the level.
         ratio_limit: Limit of the side ratio, above 1.
     """
-    rows, columns = grid
     targets, count = boxes.shape[0], anchors.shape[0]
     centre, size = boxes[:, 2:4], boxes[:, 4:6]
     ratio = size[:, None] / anchors[None]
     fits = torch.maximum(ratio, 1.0 / ratio).amax(dim=2) < ratio_limit  # (T, A)
 
-    limit = torch.tensor([columns, rows], device=boxes.device)
-    cell = torch.minimum(centre.floor().long().clamp(min=0), limit - 1)
+    cell = _inside(centre.floor().long(), grid)
     fraction = centre - cell
     step = (fraction > 0.5).long() - (fraction < 0.5).long()  # towards the nearer side; 0 on the middle line
     zero = torch.zeros_like(step[:, 0])
@@ -86,10 +84,10 @@ def match(boxes: Tensor, anchors: Tensor, grid: tuple[int, int], ratio_limit: fl
         ],
         dim=1,
     )  # (T, 3, 2)
-    place = cell[:, None] + offset
-    exists = ((place >= 0) & (place < limit)).all(dim=2)
+    there = cell[:, None] + offset
+    place = _inside(there, grid)
+    exists = (there == place).all(dim=2)
     exists[:, 1:] &= step != 0
-    place = torch.minimum(place.clamp(min=0), limit - 1)
 
     shape = (targets, count, NEIGHBOURS)
     own = torch.cat([centre[:, None] - place, size[:, None].expand(-1, NEIGHBOURS, -1)], dim=2)  # (T, 3, 4)
@@ -102,6 +100,12 @@ def match(boxes: Tensor, anchors: Tensor, grid: tuple[int, int], ratio_limit: fl
         box=own[:, None].expand(*shape, 4).reshape(-1, 4),
         class_id=boxes[:, 1].long()[:, None, None].expand(shape).reshape(-1),
     )
+
+
+def _inside(cells: Tensor, grid: tuple[int, int]) -> Tensor:
+    """Clamp (..., 2) columns and rows of cells to a grid of so many rows and columns."""
+    rows, columns = grid
+    return torch.stack([cells[..., 0].clamp(0, columns - 1), cells[..., 1].clamp(0, rows - 1)], dim=-1)
 
 
 def complete_iou(first: Tensor, second: Tensor, eps: float = 1e-7) -> Tensor:

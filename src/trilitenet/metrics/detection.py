@@ -35,6 +35,8 @@ __all__ = [
     "DetectionScores",
     "OperatingPoint",
     "check_image",
+    "in_regions",
+    "match_boxes",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -92,7 +94,7 @@ class DetectionScores:
     Attributes:
         images: Labelled images with a true box or a predicted one.
         both_empty: Labelled images with neither.
-        not_labelled: Images without truth.
+        not_labelled: Images without truth, or without a prediction.
         objects: True boxes (ignored regions apart).
         boxes: Predicted boxes, ignored ones left out.
         ap50: AP at IoU 0.5, mean over classes.
@@ -317,27 +319,17 @@ class DetectionMetric:
     ) -> tuple[int, int, int]:
         """Match sorted boxes to true ones of any class at IoU 0.5, into the confusion matrix."""
         background = len(self.class_names)
-        overlap = box_overlap(boxes, np.asarray(truth, np.float64).reshape(-1, 4))
-        covered = pardoned | (np.max(box_cover(boxes, regions), axis=1, initial=0) >= 0.5)
         classes = np.asarray(truth_class, np.int64)
-        free: NDArray[np.bool_] = np.ones(len(truth), np.bool_)
-        right = wrong = 0
-        for row in range(len(boxes)):
-            reach = np.where(free, overlap[row], -1.0)
-            # A true box of the same class goes before one of another.
-            same = np.where(classes == class_id[row], reach, -1.0)
-            pick = same if len(same) and same.max() >= 0.5 else reach
-            if len(pick) and pick.max() >= 0.5:
-                target = int(pick.argmax())
-                free[target] = False
-                true_class = int(classes[target])
-                self._confusion[true_class, int(class_id[row])] += 1
-                right, wrong = right + (true_class == class_id[row]), wrong + (true_class != class_id[row])
-            elif not covered[row]:
-                self._confusion[background, int(class_id[row])] += 1
-                wrong += 1
-        self._confusion[:background, background] += np.bincount(classes[free], minlength=background)
-        return int(right), int(wrong), len(truth) - int(right)
+        target = match_boxes(boxes, class_id, truth, classes)
+        met = target >= 0
+        counted = met | ~(pardoned | in_regions(boxes, regions))
+        true_class = np.full(len(boxes), background, np.int64)
+        true_class[met] = classes[target[met]]
+        np.add.at(self._confusion, (true_class[counted], np.asarray(class_id, np.int64)[counted]), 1)
+        alone = np.delete(classes, target[met])
+        self._confusion[:background, background] += np.bincount(alone, minlength=background)
+        right = int((true_class == class_id).sum())
+        return right, int(counted.sum()) - right, len(classes) - right
 
     # Scores -------------------------------------------------------------------------------------------------------
 
@@ -511,6 +503,38 @@ class DetectionMetric:
         unpack_tables(metric._tables(), state)
         metric._confusion = np.asarray(state["confusion"], np.int64)
         return metric
+
+
+def match_boxes(
+    boxes: NDArray[Any], class_id: NDArray[Any], truth: NDArray[Any], truth_class: NDArray[Any]
+) -> NDArray[np.intp]:
+    """Return the true box of each box at IoU 0.5, -1 for none, for what is counted and drawn of one image.
+
+    Each box takes the free true box that it overlaps most, one of its own class before one of another.
+
+    Args:
+        boxes: (D, 4) predicted left, top, right, bottom, best first.
+        class_id: (D,) class ids.
+        truth: (G, 4) true boxes.
+        truth_class: (G,) class ids.
+    """
+    overlap = box_overlap(np.asarray(boxes, np.float64), np.asarray(truth, np.float64).reshape(-1, 4))
+    target = np.full(len(boxes), -1, np.intp)
+    free: NDArray[np.bool_] = np.ones(len(truth_class), np.bool_)
+    for row in range(len(boxes)):
+        reach = np.where(free, overlap[row], -1.0)
+        same = np.where(np.asarray(truth_class) == class_id[row], reach, -1.0)
+        pick = same if len(same) and same.max() >= 0.5 else reach
+        if len(pick) and pick.max() >= 0.5:
+            target[row] = pick.argmax()
+            free[target[row]] = False
+    return target
+
+
+def in_regions(boxes: NDArray[Any], regions: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which (D, 4) boxes lie by half or more in one of (M, 4) ignored regions."""
+    cover = box_cover(np.asarray(boxes, np.float64), np.asarray(regions, np.float64).reshape(-1, 4))
+    return np.asarray(np.max(cover, axis=1, initial=0) >= 0.5)
 
 
 def _ap(sums: RankedSums, hit: NDArray[np.bool_], counted: NDArray[np.bool_], objects: FloatArray) -> FloatArray:

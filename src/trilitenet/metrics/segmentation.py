@@ -123,7 +123,7 @@ class SegmentationScores:
     Attributes:
         images: Images that count.
         both_empty: Labelled images left out because prediction and truth are both empty.
-        not_labelled: Images left out because they have no truth.
+        not_labelled: Images left out because they have no truth, or no prediction.
         miou: Mean of foreground and background IoU.
         iou: Foreground IoU.
         precision: Of foreground pixels.

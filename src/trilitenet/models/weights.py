@@ -21,12 +21,20 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from trilitenet.config import ARTEFACT_SUFFIXES, STRIDES, VARIANTS, Anchors, ModelCard, get_variant, shipped_weights
+from trilitenet.config import (
+    ARTEFACT_SUFFIXES,
+    CARD_KEY,
+    STRIDES,
+    VARIANTS,
+    Anchors,
+    ModelCard,
+    get_variant,
+    shipped_weights,
+)
 from trilitenet.errors import ConfigError, OutputError, WeightsError, replacing
 from trilitenet.models.trilitenet import TriLiteNet, build_network
 
 __all__ = [
-    "CARD_KEY",
     "import_published",
     "load_network",
     "read_card",
@@ -34,8 +42,6 @@ __all__ = [
     "save_network",
 ]
 
-CARD_KEY: Final = "trilitenet.card"
-"""Key of the card in the safetensors metadata."""
 
 _RENAMES: Final = (
     (r"model\.0\.level2_0\.c1\.conv\.", "encoder.level2_down.reduce."),
@@ -353,7 +359,7 @@ def _read_pickle(path: Path) -> dict[str, Tensor]:
 def _guess_variant(state: Mapping[str, Tensor], source: Path) -> str:
     first = state.get("model.0.level1.conv.weight")
     for config in VARIANTS.values():
-        if first is not None and first.shape[0] == config.channels[0]:
+        if first is not None and first.ndim == 4 and first.shape[0] == config.channels[0]:
             return config.name
     raise WeightsError(f"{source}: is not a published TriLiteNet checkpoint (no known model.0.level1.conv.weight)")
 

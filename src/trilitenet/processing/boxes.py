@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["box_area", "box_iou", "clip_boxes", "cxcywh_to_xyxy", "xyxy_to_cxcywh"]
+__all__ = ["best_side_ratio", "box_area", "box_iou", "clip_boxes", "cxcywh_to_xyxy", "xyxy_to_cxcywh"]
 
 FloatArray = NDArray[np.floating[Any]]
 
@@ -42,6 +42,12 @@ def box_iou(first: FloatArray, second: FloatArray) -> NDArray[np.float32]:
     iou = np.zeros(intersection.shape, np.float32)
     np.divide(intersection, union, out=iou, where=union > 0, casting="unsafe")
     return iou
+
+
+def best_side_ratio(sizes: FloatArray, anchors: FloatArray) -> FloatArray:
+    """Return (N,) the worse side ratio, <= 1, of the best of (A, 2) anchors for each of (N, 2) widths and heights."""
+    ratio = sizes[:, None] / anchors[None]
+    return np.asarray(np.minimum(ratio, 1 / ratio).min(axis=2).max(axis=1))
 
 
 def clip_boxes(xyxy: FloatArray, size: tuple[int, int]) -> NDArray[np.float32]:

@@ -15,10 +15,8 @@ from PIL import ExifTags, Image
 
 from trilitenet.errors import InputError, ShapeError
 
-__all__ = ["IMAGE_SUFFIXES", "read_image", "to_rgb", "upright_size"]
+__all__ = ["read_image", "to_rgb", "upright_size"]
 
-IMAGE_SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm"})
-"""File name endings, in lower case, that are taken for images in folders."""
 
 _BROKEN = (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error, Image.DecompressionBombError)
 """What Pillow's decoders raise on broken files."""
