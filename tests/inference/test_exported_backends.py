@@ -323,6 +323,27 @@ def test_engine_files(tmp_path: Path) -> None:
         unpack_engine(path)
 
 
+def test_metadata_that_is_no_text() -> None:
+    with pytest.raises(WeightsError, match="its card is not JSON"):
+        read_metadata({CARD_KEY: 5, ARTEFACT_KEY: "{}"}, "a.engine")  # type: ignore[dict-item]
+
+
 def test_metadata_that_is_no_json() -> None:
     with pytest.raises(WeightsError, match="not JSON"):
         read_metadata({CARD_KEY: ModelCard("tiny").to_json(), ARTEFACT_KEY: "{"}, "x.onnx")
+
+
+@pytest.mark.parametrize("names", [("car",), tuple("abcdefg")])
+def test_a_card_of_another_graph_is_told(artefacts: Artefacts, names: tuple[str, ...]) -> None:
+    backend = OnnxBackend(artefacts.folder / "model.onnx", "cpu")
+    backend._card = dataclasses.replace(backend.card, class_names=names)
+    with pytest.raises(WeightsError, match=f"the card names {len(names)} classes, but the graph gives rows of 7"):
+        backend.run(artefacts.images[:1])
+
+
+def test_a_page_is_no_graph(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.xml").write_text("<html></html>")
+    (tmp_path / "a.bin").write_bytes(b"")
+    with pytest.raises(WeightsError, match="does not begin as one"):
+        OpenVINOBackend(tmp_path / "a.xml")
+    assert capfd.readouterr() == ("", "")

@@ -332,8 +332,15 @@ def test_the_wait_grows_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     assert waits == [1, 2, 4, 5, 5]
 
 
-def test_a_url_of_a_file_is_read_to_its_end(tmp_path: Path) -> None:
+def test_a_url_of_a_file_is_read_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     video(tmp_path / "a.mp4", frames=5)
+    opened, plain = [], av.open
+
+    def noted(*args: Any, **options: Any) -> Any:
+        opened.append(options["timeout"])
+        return plain(*args, **options)
+
+    monkeypatch.setattr(av, "open", noted)
     handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(tmp_path))
     monkey: Any = http.server.SimpleHTTPRequestHandler
     quiet = type("Quiet", (monkey,), {"log_message": lambda *_: None})
@@ -345,6 +352,8 @@ def test_a_url_of_a_file_is_read_to_its_end(tmp_path: Path) -> None:
         assert not failures
         assert isinstance(source, VideoReader)
         assert len(list(source)) == 5
+        assert opened == [10.0] * len(opened)
+        assert opened
     finally:
         server.shutdown()
         server.server_close()
@@ -455,3 +464,70 @@ def test_a_picture_by_two_ways_is_one_and_a_link_of_another_name_is_its_own(tmp_
 def test_impossible_clips_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigError):
         Clip(**wrong)  # type: ignore[arg-type]
+
+
+def test_matroska_that_states_a_rate_it_does_not_keep_is_counted(tmp_path: Path) -> None:
+    times = [0, 100, 200, 340, 410, 430, 1000, 1050, 1490, 2000]
+    with av.open(tmp_path / "a.mkv", "w") as container:
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 160, 96, "yuv420p"
+        stream.codec_context.time_base = Fraction(1, 1000)
+        for i, time in enumerate(times):
+            frame = av.VideoFrame.from_ndarray(shade(i), "rgb24")
+            frame.pts, frame.time_base = time, Fraction(1, 1000)
+            for packet in stream.encode(frame):
+                container.mux(packet)
+        for packet in stream.encode(None):
+            container.mux(packet)
+    frames = list(VideoReader(tmp_path / "a.mkv"))
+    assert [frame.timestamp for frame in frames] == pytest.approx([time / 1000 for time in times], abs=2e-3)
+    assert [frame.index for frame in frames] == list(range(10))
+
+
+def test_recordings_one_after_the_other_are_one_video(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "a.ts"
+    path.write_bytes(transport_stream(0, 8) + transport_stream(8, 8))
+    frames = list(VideoReader(path))
+    assert "time stamps jump back after 0.700 s" in caplog.text
+    assert [index_of(frame) for frame in frames] == [frame.index for frame in frames] == list(range(16))
+    assert [frame.timestamp for frame in frames] == pytest.approx([i / 10 for i in range(16)], abs=1e-3)
+    part = list(VideoReader(path, Clip(start=0.5, end=1.0)))
+    assert [index_of(frame) for frame in part] == [frame.index for frame in part] == list(range(5, 10))
+
+
+def test_readers_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    for ending, count in (("jpg", 2), ("png", 3)):
+        for i in range(count):
+            Image.fromarray(shade(i)).save(tmp_path / f"f{i}.{ending}")
+    sources, failures = find_sources([str(tmp_path / "f%d.jpg"), str(tmp_path / "f%d.png")])
+    assert not failures
+    assert [source.name for source in sources if isinstance(source, FrameReader)] == [
+        str(tmp_path / "f"),
+        str(tmp_path / "f-2"),
+    ]
+    assert [frame.source for source in sources for frame in source if isinstance(frame, Frame)] == [
+        *[str(tmp_path / "f")] * 2,
+        *[str(tmp_path / "f-2")] * 3,
+    ]
+
+
+def test_numbered_pictures_that_are_not_wanted_are_not_read(tmp_path: Path) -> None:
+    for i in range(9):
+        Image.fromarray(shade(i)).save(tmp_path / f"{i}.png")
+    (tmp_path / "1.png").write_bytes(b"broken")
+    (tmp_path / "4.png").write_bytes(b"broken")
+    reader = SequenceReader(str(tmp_path / "%d.png"), Clip(every=4))
+    assert [frame.index for frame in reader] == [0, 8]
+    assert reader.broken == 1
+
+
+def test_a_link_to_nothing_is_told(tmp_path: Path) -> None:
+    (tmp_path / "gone.jpg").symlink_to(tmp_path / "nope.png")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "linked").symlink_to(tmp_path / "folder")
+    for name in (str(tmp_path), str(tmp_path / "*")):
+        (source,), failures = find_sources([name])
+        assert not failures
+        (item,) = source
+        assert isinstance(item, Failure)
+        assert "gone.jpg" in item.reason

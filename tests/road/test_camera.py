@@ -42,7 +42,7 @@ def test_a_camera_file_round_trip(tmp_path: Path) -> None:
     for field in dataclasses.fields(Camera):
         np.testing.assert_allclose(getattr(read, field.name), getattr(CAMERA, field.name), atol=1e-12)
     with pytest.raises(OutputError, match="cannot be written"):
-        write_camera(CAMERA, tmp_path / "none" / "camera.yaml")
+        write_camera(CAMERA, tmp_path / "camera.yaml" / "camera.yaml")
 
 
 def test_writes_what_opencv_calibrates(tmp_path: Path) -> None:

@@ -88,6 +88,7 @@ def run_images(
     Raises:
         ShapeError: If the batch is empty, or of another shape or type, or of a size the artefact cannot take.
         BackendError: If the runtime fails.
+        WeightsError: If the card is of another graph.
     """
     check_batch(batch, MAX_STRIDE if info.size is None else 1)
     try:
@@ -104,7 +105,13 @@ def run_images(
 
     detection = None
     if "detection" in card.tasks:
-        rows = [np.asarray(result["detection"], np.float32).reshape(-1, 5 + card.classes) for result in results]
+        rows = [np.asarray(result["detection"], np.float32) for result in results]
+        if any(row.shape[-1] != 5 + card.classes for row in rows):
+            raise WeightsError(
+                f"the card names {card.classes} classes, but the graph gives rows of {rows[0].shape[-1]} numbers, "
+                f"not {5 + card.classes}; the file is damaged"
+            )
+        rows = [row.reshape(-1, 5 + card.classes) for row in rows]
         detection = np.zeros((len(rows), max(len(row) for row in rows), 5 + card.classes), np.float32)
         for padded, row in zip(detection, rows, strict=True):  # after suppression, images have different counts
             padded[: len(row)] = row

@@ -67,7 +67,7 @@ class OpenVINOBackend:
         with path.open("rb") as file:
             start = file.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
         # Checked here because OpenVINO tries every reader it has on a foreign file, and some of them talk.
-        if not start.startswith(b"\x08" if path.suffix.lower() == ".onnx" else b"<"):
+        if not start.startswith(b"\x08" if path.suffix.lower() == ".onnx" else (b"<?xml", b"<net")):
             raise WeightsError(f"{path}: not a usable OpenVINO or ONNX model (it does not begin as one)")
         weights = path.with_suffix(".bin")
         if path.suffix.lower() == ".xml" and not weights.is_file():

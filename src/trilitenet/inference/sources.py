@@ -20,7 +20,7 @@ import sys
 import threading
 import time
 import urllib.parse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, TypeAlias
@@ -29,7 +29,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.errors import ConfigError, InputError, import_extra
+from trilitenet.errors import ConfigError, InputError, free_name, import_extra
 from trilitenet.processing.images import read_image
 
 __all__ = [
@@ -56,6 +56,10 @@ VIDEO_SUFFIXES: Final = frozenset(
 
 _LOGGER: Final = logging.getLogger(__name__)
 _NUMBERED: Final = re.compile(r"%0?(\d*)d")
+_PATIENCE: Final = 10.0
+"""Seconds without data after which a connection counts as broken."""
+_OFF_BEAT: Final = 0.25
+"""Of a frame: a time stamp this far from all those that a constant rate would have is of a rate that varies."""
 _SLACK: Final = 1e-6
 """Seconds that a time stamp may be off by: a frame at 1/3 s is not before a start of 0.333333."""
 _Decoded: TypeAlias = tuple[float, Callable[[], NDArray[np.uint8]]]
@@ -165,6 +169,7 @@ class FrameReader(abc.ABC):
 
     def __iter__(self) -> Iterator[Frame]:
         given = seen = 0
+        last = -1
         broken = self.broken
         with contextlib.closing(self._decode()) as decoded:
             for count, (timestamp, make) in enumerate(decoded):
@@ -175,7 +180,14 @@ class FrameReader(abc.ABC):
                 seen += 1
                 if (seen - 1) % self.clip.every:
                     continue
-                yield Frame(make(), self.name, self._index(timestamp, count + self.broken - broken), timestamp)
+                index = last = max(last + 1, self._index(timestamp, count + self.broken - broken))
+                try:
+                    image = make()
+                except InputError as error:
+                    self.broken, broken = self.broken + 1, broken + 1  # it has been counted
+                    _LOGGER.warning("%s", error)
+                    continue
+                yield Frame(image, self.name, index, timestamp)
                 given += 1
                 if given == self.clip.max_frames:
                     break
@@ -184,7 +196,10 @@ class FrameReader(abc.ABC):
             raise InputError(f"{self.name}: has no frames that can be decoded{part}{self._cure}")
 
     def _index(self, timestamp: float, count: int) -> int:
-        """Return the position in the video of a frame before which so many came, broken ones included."""
+        """Return the position in the video of a frame before which so many came, broken ones included.
+
+        Called once for each frame that is wanted, in order; what is not after the last one becomes the next number.
+        """
         return count
 
     @abc.abstractmethod
@@ -200,23 +215,25 @@ class VideoReader(FrameReader):
     is skipped, the index is estimated by the mean rate.
 
     Args:
-        path: The file, or ``"-"`` for standard input.
+        path: The file, its URL, or ``"-"`` for standard input.
         clip: Which frames are wanted.
+        timeout: Seconds without data after which a URL is given up; None to wait for ever.
 
     Raises:
         InputError: If it is missing, empty, or no video.
         MissingExtraError: If PyAV is not installed.
     """
 
-    def __init__(self, path: str | Path, clip: Clip | None = None) -> None:
+    def __init__(self, path: str | Path, clip: Clip | None = None, *, timeout: float | None = None) -> None:
         super().__init__("stdin" if str(path) == "-" else _without_secrets(str(path)), clip)
         self._path = str(path)
+        self._timeout = timeout
         self._constant = False
         self._skipped = 0
         if self._path == "-":
             self._cure = "; an MP4 can be piped if its index comes first: ffmpeg -i IN -c copy -movflags +faststart OUT"
         else:
-            with _open_container(self._path, self.name) as container:
+            with self._open() as container:
                 stream = container.streams.video[0]
                 rate = stream.average_rate or stream.guessed_rate
                 self.rate = float(rate) if rate else None
@@ -226,8 +243,12 @@ class VideoReader(FrameReader):
                     frames = round(container.duration / 1e6 * self.rate)
                 self.expected = self.clip.expected(frames, self.rate)
 
+    def _open(self) -> Any:
+        return _open_container(self._path, self.name, timeout=self._timeout)
+
     def _decode(self) -> Any:
-        with _open_container(self._path, self.name) as container:
+        found = True
+        with self._open() as container:
             if self.clip.start and self._path != "-":
                 stream = container.streams.video[0]
                 first = stream.start_time or 0
@@ -236,13 +257,26 @@ class VideoReader(FrameReader):
             frames = _frames_of(container, self)
             for timestamp, make in itertools.islice(frames, 1):
                 self._skipped = round(timestamp * (self.rate or 0))  # 0 but after a seek
-                yield timestamp, make
-            yield from frames
+                found = timestamp <= self.clip.start + _SLACK
+                if found:
+                    yield timestamp, make
+            if found:
+                yield from frames
+        if not found:  # as in recordings one after the other, whose time stamps begin anew
+            self._skipped = 0
+            with self._open() as container:
+                yield from _frames_of(container, self)
         if self.broken:
             _LOGGER.warning("%s: %d broken frames were left out", self.name, self.broken)
 
     def _index(self, timestamp: float, count: int) -> int:
-        return round(timestamp * self.rate) if self._constant and self.rate else self._skipped + count
+        if self._constant and self.rate:
+            place = timestamp * self.rate
+            if abs(place - round(place)) < _OFF_BEAT:
+                self._skipped = round(place) - count
+                return round(place)
+            self._constant = False  # Matroska states a rate whatever its time stamps do
+        return self._skipped + count
 
 
 class StreamReader(FrameReader):
@@ -273,7 +307,7 @@ class StreamReader(FrameReader):
         retries: int = 8,
         backoff: float = 0.5,
         longest: float = 30.0,
-        timeout: float = 10.0,
+        timeout: float = _PATIENCE,
     ) -> None:
         super().__init__(_without_secrets(url), clip)
         self._url = url
@@ -387,13 +421,7 @@ class SequenceReader(FrameReader):
             timestamp = number / self.rate
             if timestamp < self.clip.start - _SLACK:
                 continue
-            try:
-                image = read_image(path)
-            except InputError as error:
-                self.broken += 1
-                _LOGGER.warning("%s", error)
-                continue
-            yield timestamp, functools.partial(np.asarray, image)
+            yield timestamp, functools.partial(read_image, path)
 
     def _index(self, timestamp: float, count: int) -> int:
         assert self.rate is not None
@@ -430,7 +458,8 @@ def find_sources(
         rate: Frames a second of numbered pictures.
 
     Returns:
-        The sources in order, each once, neighbouring pictures together; and what cannot be used.
+        The sources in order, each once, neighbouring pictures together, no two readers of one name; and what cannot be
+        used.
     """
     sources: list[Stills | FrameReader] = []
     failures: list[Failure] = []
@@ -478,7 +507,16 @@ def find_sources(
                     stills.append(path)
     if stills:
         sources.append(Stills(tuple(stills)))
+    _tell_apart(source for source in sources if isinstance(source, FrameReader))
     return sources, failures
+
+
+def _tell_apart(readers: Iterable[FrameReader]) -> None:
+    """Number readers of one name, such as ``a/%d.jpg`` and ``a/%d.png``, or two queries of a URL: ``a``, ``a-2`` ..."""
+    taken: set[str] = set()
+    for reader in readers:
+        reader.name = free_name(reader.name, taken)
+        taken.add(reader.name)
 
 
 def _printable(name: str) -> str:
@@ -489,9 +527,9 @@ def _printable(name: str) -> str:
 def _open_url(url: str, clip: Clip | None) -> FrameReader:
     """Return a reader of a file behind an HTTP URL, which has an end, or of a live stream."""
     if url.lower().startswith("http"):
-        with _open_container(url, _without_secrets(url), timeout=10.0) as container:
+        with _open_container(url, _without_secrets(url), timeout=_PATIENCE) as container:
             if container.duration:
-                return VideoReader(url, clip)
+                return VideoReader(url, clip, timeout=_PATIENCE)
     return StreamReader(url, clip)
 
 
@@ -507,7 +545,7 @@ def _expand(name: str) -> list[Path]:
     """Return the files that a path or a pattern stands for, in natural order (2 before 10)."""
     path = Path(name)
     if path.is_dir():
-        files = [child for child in path.iterdir() if child.is_file() and not child.name.startswith(".")]
+        files = [child for child in path.iterdir() if _is_file(child) and not child.name.startswith(".")]
         if not files:
             if any(child.is_dir() for child in path.iterdir()):
                 raise InputError(f"{name}: has no files itself; for those in its folders: {str(path / '**' / '*')!r}")
@@ -516,12 +554,17 @@ def _expand(name: str) -> list[Path]:
         return [path]
     elif glob.has_magic(name):
         matches = glob.glob(name, recursive=True)  # noqa: PTH207 - a pattern, not a folder
-        files = [Path(match) for match in matches if Path(match).is_file()]
+        files = [Path(match) for match in matches if _is_file(Path(match))]
         if not files:
             raise InputError(f"{name}: no file matches")
     else:
         raise InputError(f"{name}: no such file or folder")
     return sorted(files, key=lambda file: [int(t) if t.isdecimal() else t for t in re.split(r"(\d+)", str(file))])
+
+
+def _is_file(path: Path) -> bool:
+    """Return whether a path is a file, or a link to what is not there: told as one that cannot be read."""
+    return path.is_file() or (path.is_symlink() and not path.is_dir())
 
 
 @contextlib.contextmanager
@@ -592,6 +635,9 @@ def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
                 timestamp = last + step
             else:
                 first = seconds if first is None else first
+                if seconds - first < last - step:  # recordings one after the other, or a recorder that began anew
+                    _LOGGER.warning("%s: time stamps jump back after %.3f s; time goes on", reader.name, last)
+                    first = seconds - last - step
                 timestamp = seconds - first
             last = timestamp
             aspect = stream.sample_aspect_ratio or Fraction(1)

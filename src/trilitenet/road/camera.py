@@ -16,7 +16,7 @@ import yaml
 from numpy.typing import NDArray
 
 from trilitenet.config import parse
-from trilitenet.errors import ConfigError, writing
+from trilitenet.errors import ConfigError, write_file
 from trilitenet.processing.geometry import Camera
 from trilitenet.road.lanes import vanishing_point
 from trilitenet.road.structures import LaneLine
@@ -82,7 +82,7 @@ def read_camera(path: str | Path) -> Camera:
     text = re.sub(r"\A%YAML.*\n", "", text).replace("!!opencv-matrix", "")
     try:
         content: Any = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:  # the latter of a date that there is not
         raise ConfigError(f"{path}: not YAML ({' '.join(str(error).split())})") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: must be a mapping of keys such as image_width, camera_matrix and height")
@@ -135,8 +135,7 @@ def write_camera(camera: Camera, path: str | Path) -> None:
         "height": float(camera.height),
         **{name: math.degrees(getattr(camera, name)) for name in ("pitch", "yaw", "roll")},
     }
-    with writing(path):
-        Path(path).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    write_file(Path(path), yaml.safe_dump(content, sort_keys=False))
 
 
 class SelfCalibration:

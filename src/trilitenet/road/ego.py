@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from trilitenet.processing.boxes import box_iou
 from trilitenet.processing.geometry import Camera
 from trilitenet.road.camera import CameraErrors
 from trilitenet.road.structures import EgoLane, Estimate, GroundCurve, LaneLine, LeadVehicle
@@ -498,10 +499,7 @@ class LeadFilter:
             return lead.track_id == self._identity
         if self._box is None:
             return False
-        low, high = np.maximum(box[:2], self._box[:2]), np.minimum(box[2:], self._box[2:])
-        shared = float(np.prod(np.maximum(high - low, 0)))
-        total = float(np.prod(box[2:] - box[:2]) + np.prod(self._box[2:] - self._box[:2])) - shared
-        return shared > 0.3 * total
+        return bool(box_iou(box[None], self._box[None])[0, 0] > 0.3)
 
     def _advance(self, step: float, distance: float, noise: float) -> None:
         assert self._state is not None

@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from tests.formats.readers.conftest import SIZE
 from trilitenet.data.converting import convert
@@ -118,4 +119,20 @@ def test_bad_mappings(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "mapping.yaml"
     path.write_text(text)
     with pytest.raises(ConfigError, match=message):
+        read_mapping(path)
+
+
+@pytest.mark.parametrize(
+    "mapping",
+    [
+        {"images": "images/{name}"},
+        {"drivable_mask": {"path": "m/{image}.png"}},
+        {"lane_mask": {"path": "m/{.png"}},
+        {"lane_mask": {"path": "m/{0}.png"}},
+    ],
+)
+def test_a_place_in_braces_that_is_not_known_is_named(tmp_path: Path, mapping: dict[str, object]) -> None:
+    path = tmp_path / "classes.yaml"
+    path.write_text(yaml.safe_dump(mapping))
+    with pytest.raises(ConfigError, match=r"may hold \{split\}"):
         read_mapping(path)

@@ -71,10 +71,21 @@ def test_polygons_confidences_and_missing_files(root: Path, tmp_path: Path) -> N
     assert empty.objects == ()
 
 
-@pytest.mark.parametrize("line", ["0 0.5 0.5 half 0.5", "0 0.5 0.5", "0 0.1 0.2 0.3 0.4 0.5 0.6 0.7"])
+@pytest.mark.parametrize(
+    "line", ["0 0.5 0.5 half 0.5", "0 0.5 0.5", "0 0.1 0.2 0.3 0.4 0.5 0.6 0.7", "0 nan 0.5 0.5 0.5"]
+)
 def test_a_bad_line_is_named(root: Path, line: str) -> None:
     (root / "labels/train/a.txt").write_text(f"0 0.5 0.5 0.5 0.5\n{line}\n")
     with pytest.raises(DataError, match=r"a\.txt, line 2"):
+        read_yolo(root).record("train", "a")
+
+
+@pytest.mark.parametrize(
+    ("line", "number"), [("0 320 180 50 40", "320"), ("0 0.5 0.5 0.5 0.5 0.9 17", "17"), ("0 1.01 0.5 -3 0.1", "-3")]
+)
+def test_pixels_and_numbers_of_tracks_are_no_coordinates(root: Path, line: str, number: str) -> None:
+    (root / "labels/train/a.txt").write_text(line)
+    with pytest.raises(DataError, match=rf"line 1: {number} is no coordinate in \[0, 1\]; divide pixels"):
         read_yolo(root).record("train", "a")
 
 

@@ -116,7 +116,8 @@ def test_ctrl_c_waits_until_a_result_is_whole(
     assert steps
     assert signal.getsignal(signal.SIGINT) is ctrl_c
     if name == "openlabel":
-        assert all(len(json.loads(path.read_text())["openlabel"]["frames"]) == 1 for path in tmp_path.glob("*.json"))
+        written = [json.loads(path.read_text())["openlabel"] for path in tmp_path.glob("*.json")]
+        assert [len(one["frames"]) for one in written] == [1, 1]
     elif name == "cvat":
         images = ElementTree.parse(tmp_path / "cvat-images.xml").findall("image")
         assert [len(image) for image in images] == [4, 4]
@@ -158,3 +159,13 @@ def test_a_failed_write_leaves_no_file_with_a_gap(
     with pytest.raises(OutputError, match="gap"):
         write()
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["json", "openlabel"])
+def test_a_value_that_json_has_not_leaves_no_broken_file(name: str, tmp_path: Path, video: list[Perception]) -> None:
+    with open_writer(name, tmp_path) as writer:
+        writer.write(video[0])
+        with pytest.raises(ValueError, match="JSON"):
+            writer.write(dataclasses.replace(video[1], timestamp=float("nan")))
+    (path,) = tmp_path.glob("*.json")
+    assert json.loads(path.read_text())

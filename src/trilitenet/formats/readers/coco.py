@@ -16,11 +16,9 @@ import numpy as np
 
 from trilitenet.data.records import AreaLabel, CocoRuns, ImageRecord, LaneLabel, ListedRecords, ObjectLabel
 from trilitenet.errors import DataError, brief
-from trilitenet.formats.readers.mapping import LabelMapping, Shapes, find_image, read_json
+from trilitenet.formats.readers.mapping import SPLIT_NAMES, LabelMapping, Shapes, find_image, read_json
 
 __all__ = ["read_coco"]
-
-_SPLIT_NAMES = {"train": "train", "val": "val", "valid": "val", "validation": "val", "test": "test"}
 
 
 def read_coco(root: str | Path, mapping: LabelMapping | None = None) -> ListedRecords:
@@ -41,8 +39,8 @@ def read_coco(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
     if root.is_file() and folders[0].resolve().name == "annotations":
         folders.append(folders[0].resolve().parent)
     chosen, unused = _annotation_files(root, mapping.split)
-    for path, split in chosen:
-        items, missing = _read_file(path, split, folders, mapping)
+    for path, split, content in chosen:
+        items, missing = _read_file(content, path, split, folders, mapping)
         records[split] += items
         found.append(f"{split}: {len(items)} images of {path.name}; {missing} more are not there")
     if not any(records.values()):
@@ -53,24 +51,31 @@ def read_coco(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
     return ListedRecords(splits, tuple(found), mapping.origin("coco", root))
 
 
-def _annotation_files(root: Path, default: str) -> tuple[list[tuple[Path, str]], list[Path]]:
-    """Return (file, split) of the files to read, and the files that are left out for them."""
+def _annotation_files(root: Path, default: str) -> tuple[list[tuple[Path, str, Any]], list[Path]]:
+    """Return (file, split, content) of the files to read, and the files that are left out for them."""
     if root.is_file():
-        return [(root, default)], []
+        return [(root, default, read_json(root))], []
     files = sorted({*root.glob("*.json"), *root.glob("annotations/*.json"), *root.glob("*/_annotations.coco.json")})
-    splits = {path: _split_of(path, default) for path in files if _is_coco(path)}
-    whole = {split for path, split in splits.items() if path.name.startswith("instances_")}
-    chosen = {path: split for path, split in splits.items() if path.name.startswith("instances_") or split not in whole}
+    chosen: list[tuple[Path, str, Any]] = []
+    for whole in (True, False):  # COCO's own captions and key points are of the images of instances_*.json
+        taken = {split for _, split, _ in chosen}
+        for path in files:
+            split = _split_of(path, default)
+            if path.name.startswith("instances_") != whole or split in taken:
+                continue
+            content = read_json(path)
+            if _is_coco(content):
+                chosen.append((path, split, content))
     if not chosen:
         raise DataError(
             f"{root}: no COCO annotations; looked for *.json, annotations/*.json and */_annotations.coco.json with "
             "the keys 'images' and 'annotations', and a 'category_id' in these"
         )
-    return [*chosen.items()], [path for path in files if path not in chosen]
+    read = {path for path, _, _ in chosen}
+    return chosen, [path for path in files if path not in read]
 
 
-def _is_coco(path: Path) -> bool:
-    content = read_json(path)
+def _is_coco(content: Any) -> bool:
     if not isinstance(content, dict) or not {"images", "annotations"} <= set(content):
         return False
     items = content["annotations"]
@@ -82,11 +87,12 @@ def _is_coco(path: Path) -> bool:
 def _split_of(path: Path, default: str) -> str:
     stem = path.parent.name if path.name == "_annotations.coco.json" else path.stem
     words = re.split(r"[^a-z]+", stem.lower())
-    return next((_SPLIT_NAMES[word] for word in reversed(words) if word in _SPLIT_NAMES), default)
+    return next((SPLIT_NAMES[word] for word in reversed(words) if word in SPLIT_NAMES), default)
 
 
-def _read_file(path: Path, split: str, roots: list[Path], mapping: LabelMapping) -> tuple[list[ImageRecord], int]:
-    content = read_json(path)
+def _read_file(
+    content: Any, path: Path, split: str, roots: list[Path], mapping: LabelMapping
+) -> tuple[list[ImageRecord], int]:
     try:
         names = {item["id"]: str(item["name"]) for item in content.get("categories", ())}
         labels: dict[Any, list[dict[str, Any]]] = defaultdict(list)

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ListedRecords, ObjectLabel, RowRuns
 from trilitenet.errors import DataError, brief
-from trilitenet.formats.readers.mapping import LabelMapping, Shapes, find_image, hull
+from trilitenet.formats.readers.mapping import SPLIT_NAMES, LabelMapping, Shapes, find_image, hull
 
 __all__ = ["read_cvat"]
 
-_SPLITS = {"train": "train", "training": "train", "val": "val", "validation": "val", "valid": "val", "test": "test"}
 _SHAPES = {"box", "polygon", "polyline", "mask", "points", "ellipse", "cuboid", "skeleton", "tag"}
 
 
@@ -86,7 +85,7 @@ def _read_file(path: Path, folder: Path, mapping: LabelMapping, records: dict[st
     for element in images:
         name = element.get("name", "")
         subset = (element.get("subset") or "").lower()
-        split = _SPLITS.get(subset, subset or mapping.split)
+        split = SPLIT_NAMES.get(subset, subset or mapping.split)
         place = find_image(
             name, [folder, folder / "images", folder / split, folder / "images" / split, folder / "data"]
         )

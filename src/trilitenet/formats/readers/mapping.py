@@ -14,10 +14,19 @@ from numpy.typing import NDArray
 from trilitenet.config import Task, check_tasks, parse, read_yaml
 from trilitenet.data.description import VEHICLES
 from trilitenet.data.records import AreaLabel, LaneLabel, ObjectLabel, RunLabel
-from trilitenet.errors import ConfigError, DataError
+from trilitenet.errors import ConfigError, DataError, brief
 
-__all__ = ["LabelMapping", "MaskRule", "parse_colour", "read_mapping"]
+__all__ = ["SPLIT_NAMES", "LabelMapping", "MaskRule", "parse_colour", "read_mapping"]
 
+SPLIT_NAMES: Final = {
+    "train": "train",
+    "training": "train",
+    "val": "val",
+    "valid": "val",
+    "validation": "val",
+    "test": "test",
+}
+"""What foreign formats call a split -> what it is called here."""
 _KINDS: Final = ("direct", "alternative", "foreground", "ignore", "background")
 
 
@@ -92,6 +101,14 @@ class LabelMapping:
     def __post_init__(self) -> None:
         if self.tasks:
             check_tasks(self.tasks)
+        paths = (("images", self.images, ("split",)),)
+        masks = (("drivable_mask", self.drivable_mask), ("lane_mask", self.lane_mask))
+        for name, path, known in (*paths, *((name, rule.path, ("split", "name")) for name, rule in masks)):
+            try:
+                path.format(**dict.fromkeys(known, ""))
+            except (LookupError, ValueError) as error:
+                places = " and ".join(f"{{{one}}}" for one in known)
+                raise ConfigError(f"{name}: {path!r} may hold {places} alone in braces ({brief(error)})") from error
 
     def origin(self, kind: str, root: Path) -> dict[str, str]:
         """Return what a conversion of a data set of this kind and meaning remembers; see `RecordSource`."""

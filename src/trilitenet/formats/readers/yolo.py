@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import yaml
@@ -20,6 +20,9 @@ from trilitenet.errors import DataError, brief
 from trilitenet.formats.readers.mapping import LabelMapping, Shapes, hull
 
 __all__ = ["YoloSource", "read_yolo"]
+
+_BEYOND: Final = 2.0
+"""A coordinate that is larger is none in [0, 1] that lies a little outside of the image."""
 
 
 class YoloSource:
@@ -85,6 +88,12 @@ class YoloSource:
                 values = np.array([float(word) for word in words[1:]])
             except (ValueError, OverflowError) as error:
                 raise DataError(f"{path}, line {number}: not numbers ({error})") from error
+            coordinates = values[:4] if len(values) in (4, 5) else values
+            if not (np.abs(coordinates) <= _BEYOND).all():
+                raise DataError(
+                    f"{path}, line {number}: {coordinates[~(np.abs(coordinates) <= _BEYOND)][0]:g} is no coordinate in "
+                    "[0, 1]; divide pixels by the image's size, and leave the numbers of tracks out"
+                )
             if len(values) in (4, 5):
                 centre, extent = values[:2] * scale, values[2:4] * scale
                 x1, y1, x2, y2 = (float(v) for v in (*(centre - extent / 2), *(centre + extent / 2)))

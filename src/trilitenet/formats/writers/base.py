@@ -23,7 +23,7 @@ from pathlib import Path, PurePath
 from types import FrameType, TracebackType
 from typing import IO, TYPE_CHECKING, Any, ClassVar, Final
 
-from trilitenet.errors import ConfigError, OutputError, did_you_mean, part_of, writing
+from trilitenet.errors import ConfigError, OutputError, did_you_mean, free_name, part_of, writing
 from trilitenet.structures import Perception
 
 if TYPE_CHECKING:
@@ -167,12 +167,7 @@ class Writer(abc.ABC):
             self._unnamed += 1
             return f"image-{self._unnamed:06d}"
         if source not in self._stems:
-            stem = PurePath(source).stem or "image"
-            number = 1
-            name = stem
-            while name in self._taken:
-                number += 1
-                name = f"{stem}-{number}"
+            name = free_name(PurePath(source).stem or "image", self._taken)
             self._stems[source] = name
             self._names[PurePath(source).name] += 1
             self._taken.add(name)
@@ -255,11 +250,9 @@ class JsonStream:
 
     def add(self, value: Any, key: str | None = None) -> None:
         """Write the next element of the list, or the next member of the object."""
-        self._handle.write("\n" if self._first else ",\n")
+        text = dumps(value) if key is None else f"{json.dumps(key)}: {dumps(value)}"  # whole, or it raises first
+        self._handle.write(("\n" if self._first else ",\n") + text)
         self._first = False
-        if key is not None:
-            self._handle.write(f"{json.dumps(key)}: ")
-        self._handle.write(dumps(value))
 
     def close(self, tail: str) -> None:
         """Write the JSON text after the last element, and close the file."""
