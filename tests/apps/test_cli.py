@@ -230,3 +230,16 @@ def test_an_unknown_level_of_the_log_is_one_line(
     assert capsys.readouterr().err == (
         "error: TRILITENET_LOG=LOUD is no level of a log; take DEBUG, INFO, WARNING or ERROR\n"
     )
+
+
+def test_a_reader_that_has_gone_does_not_change_the_exit_code(tmp_path: Path) -> None:
+    (tmp_path / "images" / "train").mkdir(parents=True)
+    (tmp_path / "det_annotations" / "train").mkdir(parents=True)
+    words = [sys.executable, "-m", "trilitenet", "data", "check", str(tmp_path), "--workers", "1"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        told = process.stderr.read()
+    assert process.returncode == 1
+    assert "Traceback" not in told

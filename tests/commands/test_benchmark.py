@@ -4,11 +4,15 @@ import json
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from tests.artefacts import Artefacts
 from trilitenet.commands.benchmark import benchmark
-from trilitenet.errors import ConfigError
+from trilitenet.errors import ConfigError, OutputError
+from trilitenet.inference.torch_backend import TorchBackend
+from trilitenet.structures import RawOutputs
 
 
 def test_models_take_turns(artefacts: Artefacts, tmp_path: Path) -> None:
@@ -69,3 +73,38 @@ def test_a_size_that_the_network_cannot_take_is_refused(
 def test_no_threads_or_streams_are_refused(options: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match="--streams and --threads must be at least 1"):
         benchmark(threads=options.get("threads"), streams=options.get("streams", 1))
+
+
+def test_nothing_to_measure_and_a_place_that_cannot_be_written_are_told_before(tmp_path: Path) -> None:
+    for nothing in ({"batch": ()}, {"backend": ()}):
+        with pytest.raises(ConfigError, match="nothing to measure"):
+            benchmark(**nothing)  # type: ignore[arg-type]
+    (tmp_path / "file").touch()
+    place = tmp_path / "file" / "a.png"
+    for output, plot in ((place, None), (None, place)):
+        with pytest.raises(OutputError, match="file is no folder"):
+            benchmark("no such model", output=output, plot=plot)
+
+
+def test_what_would_be_ignored_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="leave models and --plot out"):
+        benchmark("tiny", table="cost")
+    with pytest.raises(ConfigError, match="leave models and --plot out"):
+        benchmark(table="cost", plot=tmp_path / "a.png")
+    with pytest.raises(ConfigError, match="--plot must end in"):
+        benchmark(plot=tmp_path / "a.xyz")
+    with pytest.raises(ConfigError, match="--source must be at least 1x1, got -5x100"):
+        benchmark(stage="frame", source=(-5, 100))
+
+
+def test_whole_frames_take_the_size_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    plain = TorchBackend.run
+
+    def run(self: TorchBackend, batch: NDArray[np.uint8]) -> RawOutputs:
+        seen.append(batch.shape)
+        return plain(self, batch)
+
+    monkeypatch.setattr(TorchBackend, "run", run)
+    benchmark("tiny", stage="frame", device="cpu", rounds=1, warmup=0, size=(64, 128), source=(72, 128))
+    assert set(seen) == {(1, 96, 128, 3)}

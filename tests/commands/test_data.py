@@ -47,7 +47,9 @@ def test_convert_both_ways(raw: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert "left out 1 x lane: crosswalk" in shown
     result = convert(str(raw), tmp_path / "two", kind="bdd100k", workers=1)
     assert result.report.images == {"train": 2, "val": 1}
-    for path in (tmp_path / "one").rglob("*.png"):
+    written = sorted((tmp_path / "one").rglob("*.png"))
+    assert written
+    for path in written:
         assert path.read_bytes() == (tmp_path / "two" / path.relative_to(tmp_path / "one")).read_bytes()
 
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,9 +12,10 @@ import pytest
 from tests.artefacts import Artefacts
 from trilitenet.apps.cli import main
 from trilitenet.commands.compare import compare
-from trilitenet.commands.evaluate import evaluate
+from trilitenet.commands.evaluate import evaluate, hash_dataset, hash_model
 from trilitenet.commands.score import score
 from trilitenet.config import ARTEFACT_KEY, ModelCard
+from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.synthetic_files import write_dataset
 from trilitenet.engine.report import Report
 from trilitenet.errors import ConfigError, DataError, OutputError
@@ -67,12 +69,43 @@ def test_the_saved_predictions_score_the_same(run: tuple[Report, Path], data: Pa
     )
 
 
+def test_what_labels_mean_is_part_of_their_hash(data: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(data, tmp_path / "data")
+    before = hash_dataset(DrivingDataset(root, "val"))
+    (root / "dataset.yaml").write_text("classes: {vehicle: [bus]}\nlane: {above: 254}\n")
+    after = hash_dataset(DrivingDataset(root, "val"))
+    assert [name for name in before if before[name] != after[name]] == ["lane", "boxes"]
+    (root / "bonnet.png").write_bytes(b"mask")
+    (root / "dataset.yaml").write_text("classes: {vehicle: [bus]}\nlane: {above: 254}\nego_mask: bonnet.png\n")
+    own_car = hash_dataset(DrivingDataset(root, "val"))
+    (root / "bonnet.png").write_bytes(b"another mask")
+    assert all(
+        own_car[name] != hash_dataset(DrivingDataset(root, "val"))[name] for name in ("drivable", "lane", "boxes")
+    )
+
+
+def test_the_weights_beside_a_graph_are_part_of_its_hash(tmp_path: Path) -> None:
+    for graph in ("a.xml", "a.ncnn.param"):
+        path = tmp_path / graph
+        path.write_text("graph")
+        path.with_suffix(".bin").write_bytes(b"weights")
+        before = hash_model(str(path))
+        path.with_suffix(".bin").write_bytes(b"others")
+        assert hash_model(str(path)) not in (before, None)
+
+
+def test_a_confidence_out_of_range_is_refused(data: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"--confidence must be in \[0, 1\], got 7"):
+        score(tmp_path, data=data, confidence=7)
+
+
 def test_reports_are_compared(run: tuple[Report, Path], data: Path, tmp_path: Path) -> None:
     _, folder = run
-    score(folder / "predictions", data=data, resamples=0, worst=0, output=tmp_path / "scored")
+    score(folder / "predictions", data=data, confidence=0.4, resamples=0, worst=0, output=tmp_path / "scored")
     comparison = compare(folder, tmp_path / "scored" / "report.json", published=True, output=tmp_path, resamples=20)
     assert len(comparison.names) == 2
     assert not comparison.unpaired
+    assert "detection precision, recall and F1 are stated at other confidences" in comparison.summary()
     assert (tmp_path / "comparison.html").exists()
     with pytest.raises(OutputError, match="--overwrite"):
         compare(folder, output=tmp_path)

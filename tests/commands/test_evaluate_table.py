@@ -37,7 +37,7 @@ def test_differences_are_to_the_first_row_of_the_model() -> None:
 
 def test_options_that_do_not_fit(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="leave bf16 out"):
-        evaluate_table("tiny", data=tmp_path, output=tmp_path, format="onnx")
+        evaluate_table("tiny", data=tmp_path, output=tmp_path, format="onnx", precisions=("fp32", "bf16"))
     with pytest.raises(ConfigError, match="at least one"):
         evaluate_table("tiny", data=tmp_path, output=tmp_path, precisions=())
     with pytest.raises(ConfigError, match="--calibration-frames must be at least 1, got 0"):
@@ -45,6 +45,12 @@ def test_options_that_do_not_fit(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match=r"file/precisions\.md: cannot be written \(.*file is no folder\)$"):
         evaluate_table("tiny", data=tmp_path, output=tmp_path / "file")
+
+
+def test_what_int8_needs_is_told_before_the_work(tmp_path: Path) -> None:
+    for precisions in (None, ("fp32", "int8")):
+        with pytest.raises(ConfigError, match="int8 needs a fixed --size"):
+            evaluate_table(data=tmp_path, output=tmp_path, format="onnx", size="dynamic", precisions=precisions)
 
 
 def test_int8_is_named_by_what_calibrates_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -55,6 +55,10 @@ def test_options_that_do_not_fit(artefacts: Artefacts, tmp_path: Path) -> None:
         ({"portable": True, "nms": True}, "--portable keeps to operators"),
         ({"portable": True, "layout": "pixels"}, "--portable is planar"),
         ({"format": "ncnn", "layout": "pixels"}, "--portable is planar"),
+        ({"portable": True, "layout": "planar-maximum"}, "--portable is planar"),
+        ({"format": "tensorrt", "size": "dynamic"}, "tensorrt needs a fixed --size"),
+        ({"format": "tensorrt", "output": tmp_path / "tiny.fp16"}, "end with .engine"),
+        ({"precision": "int8", "calibration": tmp_path, "max_drop": 1.0, "nms": True}, "that --nms drops"),
         ({"format": "tensorrt", "precision": "int8"}, "tensorrt artefacts come as fp32, fp16, bf16, not int8"),
         ({"max_drop": 0.5}, "--max-drop"),
         ({"format": "ncnn", "precision": "bf16"}, "ncnn artefacts come as fp32, fp16, not bf16"),
@@ -99,9 +103,10 @@ def test_what_is_no_folder_of_pictures_is_told(tmp_path: Path) -> None:
             find_pictures(tmp_path / name, 8, "train")
 
 
-def test_a_dynamic_program_says_how_small_a_side_may_be(artefacts: Artefacts, tmp_path: Path) -> None:
-    weights = str(artefacts.folder / "weights.safetensors")
-    path = export(weights, format="torch", size="dynamic", output=tmp_path / "a.pt2").path
+def test_a_dynamic_program_says_how_small_a_side_may_be(tmp_path: Path) -> None:
+    network = build_network("tiny", tasks=("lane",))
+    save_network(network, tmp_path / "lane.safetensors", network.card)
+    path = export(str(tmp_path / "lane.safetensors"), format="torch", size="dynamic", output=tmp_path / "a.pt2").path
     program = trilitenet.load(path)
     program.backend.run(np.zeros((1, 64, 96, 3), np.uint8))
     for size in ((32, 96), (96, 32)):

@@ -49,6 +49,12 @@ def test_a_runtime_that_weights_do_not_run_on_tells_its_export(backend: str, for
         trilitenet.load("tiny", backend=backend)
 
 
+@pytest.mark.parametrize("options", [{"threads": 0}, {"threads": -1}, {"streams": 0}])
+def test_counts_below_one_are_refused_before_a_runtime_sees_them(options: dict[str, int]) -> None:
+    with pytest.raises(ConfigError, match="streams and threads must be at least 1"):
+        trilitenet.load("no.ncnn.param", threads=options.get("threads"), streams=options.get("streams", 1))
+
+
 def test_mistakes_are_named(weights: Path) -> None:
     with pytest.raises(ConfigError, match="did you mean 'torch'"):
         trilitenet.load(weights, backend="toch")

@@ -17,12 +17,13 @@ from PIL import Image
 from tests.fakes import ColourBackend, coloured_scene
 from trilitenet.apps import cli
 from trilitenet.commands.predict import RoadOptions, predict_with
-from trilitenet.errors import BackendError, ConfigError, InputError, OutputError
+from trilitenet.errors import BackendError, ConfigError, InputError, OutputError, ShapeError
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, VideoReader
 from trilitenet.inference.video import VideoWriter
 from trilitenet.models.trilitenet import build_network
 from trilitenet.models.weights import save_network
+from trilitenet.processing.geometry import Camera
 from trilitenet.structures import Perception
 
 
@@ -149,6 +150,53 @@ def test_sources_of_one_name_are_told_apart(tmp_path: Path, predictor: Predictor
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"x-2.jpg", "x-2.json", "x-3.jpg", "x-3.json"}
     assert json.loads((tmp_path / "out" / "x-3.json").read_text())["source"].endswith("c/x.png")
     assert len(report.failures) == 1
+
+
+def test_two_rows_of_pictures_of_one_name_are_two_videos(tmp_path: Path, predictor: Predictor) -> None:
+    for ending, count in (("jpg", 2), ("png", 3)):
+        for number in range(count):
+            Image.fromarray(coloured_scene(90, 160)).save(tmp_path / f"f{number}.{ending}")
+    sources = [str(tmp_path / "f%d.jpg"), str(tmp_path / "f%d.png")]
+    report = predict_with(predictor, sources, tmp_path / "out")
+    assert (report.videos, report.frames, report.exit_code) == (2, 5, 0)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"f.mp4", "f.json", "f-2.mp4", "f-2.json"}
+    for name, count in (("f", 2), ("f-2", 3)):
+        frames = json.loads((tmp_path / "out" / f"{name}.json").read_text())["frames"]
+        assert [frame["frame"] for frame in frames] == list(range(count))
+        assert len(list(VideoReader(tmp_path / "out" / f"{name}.mp4"))) == count
+
+
+@pytest.mark.parametrize("overlay", [True, False])
+def test_a_video_that_fails_in_its_middle_is_counted_with_its_frames(
+    tmp_path: Path, predictor: Predictor, overlay: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = 0
+
+    def follow(perception: Perception, parts: object) -> tuple[Perception, None]:
+        nonlocal seen
+        seen += 1
+        if seen == 4:
+            raise ShapeError("another shape")
+        return perception, None
+
+    monkeypatch.setattr("trilitenet.commands.predict._follow", follow)
+    report = predict_with(predictor, [drive(tmp_path / "drive.mp4")], tmp_path / "out", overlay=overlay)
+    assert (report.videos, report.frames, len(report.failures)) == (1, 3, 1)
+
+
+def test_a_camera_file_is_read_once(tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[Path] = []
+
+    def read_camera(path: Path) -> Camera:
+        read.append(path)
+        return Camera.from_field_of_view((90, 160), 90, height=1.4)
+
+    monkeypatch.setattr("trilitenet.commands.predict.read_camera", read_camera)
+    for number in range(3):
+        Image.fromarray(coloured_scene(90, 160)).save(tmp_path / f"{number}.png")
+    road = RoadOptions(camera=Path("camera.yaml"))
+    report = predict_with(predictor, [str(tmp_path / "*.png")], tmp_path / "out", road=road)
+    assert (report.images, read) == (3, [Path("camera.yaml")])
 
 
 def test_a_video(tmp_path: Path, predictor: Predictor) -> None:

@@ -32,7 +32,7 @@ from trilitenet.engine.loggers import CsvLogger, read_csv
 from trilitenet.engine.predictions import PredictionWriter
 from trilitenet.engine.recipe import read_recipe
 from trilitenet.engine.train import Trainer
-from trilitenet.errors import ConfigError, DataError, OutputError, TrainingError, WeightsError
+from trilitenet.errors import ConfigError, DataError, MissingExtraError, OutputError, TrainingError, WeightsError
 from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.models.encoder import Encoder
 from trilitenet.models.trilitenet import TriLiteNet
@@ -114,9 +114,10 @@ def test_resume_is_bit_for_bit(scenes: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_resume_is_bit_for_bit_with_validation_between(scenes: Path, tmp_path: Path) -> None:
+    options = {"val_split": "val", "pictures": 0}
     for steps in (3, 6):
-        train(resume=steps > 3, **settings(scenes, tmp_path / "parts", max_steps=steps, val_split="val"))
-    train(**settings(scenes, tmp_path / "straight", max_steps=6, val_split="val"))
+        train(resume=steps > 3, **settings(scenes, tmp_path / "parts", max_steps=steps, **options))
+    train(**settings(scenes, tmp_path / "straight", max_steps=6, **options))
     same(state(tmp_path / "straight"), state(tmp_path / "parts"))
 
 
@@ -138,11 +139,44 @@ def test_resuming_takes_the_new_weight_decay(scenes: Path, tmp_path: Path) -> No
     assert {tuple(group["betas"]) for group in groups} == {(0.5, 0.6)}
 
 
+def test_what_no_image_is_labelled_for_is_told(scenes: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    data = shutil.copytree(scenes, tmp_path / "data")
+    shutil.rmtree(data / "ll_seg_annotations" / "train")
+    train(**settings(data, tmp_path / "run", max_steps=1, classes=("vehicel",), sampling={"timeofdy": {"night": 2.0}}))
+    assert "no image of train is labelled for lane" in caplog.text
+    assert "no box of" in caplog.text
+    assert "no image has the attribute 'timeofdy' to sample by; did you mean 'timeofday'?" in caplog.text
+    with pytest.raises(DataError, match="no image of train is labelled for lane"):
+        train(**settings(data, tmp_path / "lane", tasks=("lane",)))
+
+
+def test_a_run_that_cannot_start_leaves_the_earlier_one(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train(**settings(scenes, tmp_path, max_steps=1))
+    before = sorted(path.name for path in tmp_path.iterdir())
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(MissingExtraError, match="wandb"):
+        train(**settings(scenes, tmp_path, loggers=("csv", "wandb")), overwrite=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_going_on_with_other_frozen_parts_is_refused(scenes: Path, tmp_path: Path) -> None:
+    train(**settings(scenes, tmp_path, max_steps=1, freeze=("drivable",)))
+    with pytest.raises(WeightsError, match=r"was trained with freeze \['drivable'\], this run has \['lane'\]"):
+        train(**settings(scenes, tmp_path, max_steps=2, freeze=("lane",)), resume=True)
+
+
+def test_the_losses_of_every_step_are_logged(scenes: Path, tmp_path: Path) -> None:
+    train(**settings(scenes, tmp_path, max_steps=5, log_every=3))  # two steps an epoch
+    assert [step for step, name, _ in read_csv(tmp_path / "metrics.csv") if name == "lr"] == [2, 3, 4, 5]
+
+
 def test_a_teacher_of_other_classes_is_refused_before_anything_is_made(scenes: Path, tmp_path: Path) -> None:
     data = shutil.copytree(scenes, tmp_path / "data")
     classes: dict[str, tuple[str, ...]] = {"car": ("car",), "lorry": ("truck",)}
     write_description(data, dataclasses.replace(read_description(data), classes=classes))
-    with pytest.raises(ConfigError, match="the teacher tells 1 classes, the data set has 2"):
+    with pytest.raises(ConfigError, match="the teacher tells the classes vehicle, the data set has car, lorry"):
         train(**settings(data, tmp_path / "run", teacher="tiny"))
     assert not (tmp_path / "run").exists()
 
@@ -412,6 +446,18 @@ def test_refusals(scenes: Path, tmp_path: Path) -> None:
         train_table(TABLES[0], data=scenes, output=tmp_path, settings="{data: x}")
     with pytest.raises(ConfigError, match="must be YAML"):
         train_table(TABLES[0], data=scenes, output=tmp_path, settings="{a: [")
+    for text in ("{multi_scale: null}", "{a: 2024-13-45}"):
+        with pytest.raises(ConfigError, match="settings must be YAML"):
+            train_table(TABLES[0], data=scenes, output=tmp_path, settings=text)
+    for unknown in ("resume", "1"):
+        with pytest.raises(ConfigError, match=f"unknown key '{unknown}'"):
+            train_table(TABLES[0], data=scenes, output=tmp_path, settings=f"{{{unknown}: 2}}")
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "x.yaml").write_text("variant: tiny\n")
+    (tmp_path / "t.yaml").write_text("title: Parts\nrows: {A: a/x.yaml, B: b/x.yaml}\n")
+    with pytest.raises(ConfigError, match="two recipes are called 'x'"):
+        train_table(tmp_path / "t.yaml", data=scenes, output=tmp_path)
     with pytest.raises(WeightsError, match="no such checkpoint"):
         train(resume=True, **settings(scenes, tmp_path / "none"))
     train(**settings(scenes, tmp_path, max_steps=1))

@@ -75,7 +75,7 @@ def test_dynamic_sizes_and_half_weights(tmp_path: Path) -> None:
     from trilitenet.inference.onnx_backend import OnnxBackend
     from trilitenet.inference.torch_backend import TorchBackend
 
-    network = lively_network()
+    network = lively_network(tasks=("lane",))
     info = ArtefactInfo("onnx", "fp16", None)
     model = build_onnx(DeployGraph(network, LAYOUTS["vectors-tiny"]), network.card, info, half=True)
     save_onnx(model, tmp_path / "a.onnx")

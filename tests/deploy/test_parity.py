@@ -40,3 +40,15 @@ def test_other_pixels_fail() -> None:
     assert other.lane is not None
     other.lane[:, :2] = 255
     assert "mask pixels agree" in parity_of(other)[0]
+
+
+def test_another_class_fails_though_the_box_is_the_same() -> None:
+    rows = np.array([[[20, 15, 16, 10, 0.9, 0.9, 0.1]]], np.float32)
+    swapped = rows[..., [0, 1, 2, 3, 4, 6, 5]]
+
+    def failures(changed: np.ndarray) -> list[str]:
+        one, other = RawOutputs(rows, None, None), RawOutputs(changed, None, None)
+        return compare(lambda _: one, lambda _: other, [CANVAS], STRICT).failures
+
+    assert failures(rows) == []
+    assert "boxes agree" in failures(swapped)[0]

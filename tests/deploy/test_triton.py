@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from trilitenet.config import ModelCard
-from trilitenet.deploy.triton import TensorSpec, read_tensors, write_triton_repository
-from trilitenet.errors import ConfigError, OutputError, WeightsError
+from trilitenet.deploy.triton import write_triton_repository
+from trilitenet.errors import OutputError, WeightsError
 
 onnx = pytest.importorskip("onnx")
 text_format = pytest.importorskip("google.protobuf.text_format")
@@ -28,12 +28,12 @@ def schema() -> Any:
     return module
 
 
-def _artefact(path: Path, batch: int | str = "batch") -> Path:
+def _artefact(path: Path) -> Path:
     """A graph with an input and outputs like the network's."""
     helper = onnx.helper
-    image = helper.make_tensor_value_info("image", onnx.TensorProto.UINT8, [batch, 384, 640, 3])
-    lane = helper.make_tensor_value_info("lane", onnx.TensorProto.UINT8, [batch, 384, 640, 3])
-    boxes = helper.make_tensor_value_info("detection", onnx.TensorProto.FLOAT, [batch, "candidates", 6])
+    image = helper.make_tensor_value_info("image", onnx.TensorProto.UINT8, [1, 384, 640, 3])
+    lane = helper.make_tensor_value_info("lane", onnx.TensorProto.UINT8, [1, 384, 640, 3])
+    boxes = helper.make_tensor_value_info("detection", onnx.TensorProto.FLOAT, [1, "candidates", 6])
     weight = helper.make_tensor("weight", onnx.TensorProto.FLOAT, [1, 1, 6], np.zeros(6, np.float32))
     nodes = [helper.make_node("Identity", ["image"], ["lane"]), helper.make_node("Identity", ["weight"], ["detection"])]
     graph = helper.make_graph(nodes, "network", [image], [boxes, lane], [weight])
@@ -48,60 +48,36 @@ def _parse(schema: Any, model: Path) -> Any:
 def test_the_config_says_what_the_artefact_is(tmp_path: Path, schema: Any) -> None:
     card = ModelCard("small", class_names=("car", 'a "quoted"\nname'), licence="frei, für alle")
     artefact = _artefact(tmp_path / "x.onnx")
-    model = write_triton_repository(artefact, tmp_path / "repository", card, max_batch=4, delay=0.003)
+    model = write_triton_repository(artefact, tmp_path / "repository", card)
     config = _parse(schema, model)
-    assert (config.name, config.backend, config.max_batch_size) == ("trilitenet_small", "onnxruntime", 4)
+    assert (config.name, config.backend, config.max_batch_size) == ("trilitenet_small", "onnxruntime", 0)
     assert model.name == config.name
     (image,) = config.input
-    assert (image.name, image.data_type, list(image.dims)) == ("image", schema.TYPE_UINT8, [384, 640, 3])
+    assert (image.name, image.data_type, list(image.dims)) == ("image", schema.TYPE_UINT8, [1, 384, 640, 3])
     assert [(o.name, o.data_type, list(o.dims)) for o in config.output] == [
-        ("detection", schema.TYPE_FP32, [-1, 6]),
-        ("lane", schema.TYPE_UINT8, [384, 640, 3]),
+        ("detection", schema.TYPE_FP32, [1, -1, 6]),
+        ("lane", schema.TYPE_UINT8, [1, 384, 640, 3]),
     ]
-    assert config.dynamic_batching.max_queue_delay_microseconds == 3000
     assert config.instance_group[0].kind == schema.ModelInstanceGroup.KIND_CPU
     assert ModelCard.from_json(config.parameters["trilitenet.card"].string_value, "x") == card
     assert (model / "1" / "model.onnx").read_bytes() == artefact.read_bytes()
 
 
-def test_a_fixed_batch_is_part_of_the_shape(tmp_path: Path, schema: Any) -> None:
-    model = write_triton_repository(
-        _artefact(tmp_path / "x.onnx", 1), tmp_path / "repository", ModelCard("tiny"), name="mine", gpu=True
-    )
-    config = _parse(schema, model)
-    assert (config.name, config.max_batch_size) == ("mine", 0)
-    assert list(config.input[0].dims) == [1, 384, 640, 3]
-    assert not config.HasField("dynamic_batching")
-    assert config.instance_group[0].kind == schema.ModelInstanceGroup.KIND_GPU
-
-
-def test_openvino_models_bring_their_weights(tmp_path: Path, schema: Any) -> None:
-    openvino = pytest.importorskip("openvino")
-    openvino.save_model(openvino.convert_model(str(_artefact(tmp_path / "x.onnx"))), tmp_path / "y.xml")
-    assert read_tensors(tmp_path / "y.xml")[0] == [TensorSpec("image", "UINT8", (-1, 384, 640, 3))]
-    model = write_triton_repository(tmp_path / "y.xml", tmp_path / "repository", ModelCard("tiny"))
-    assert _parse(schema, model).backend == "openvino"
-    assert {file.name for file in (model / "1").iterdir()} == {"model.xml", "model.bin"}
-
-
-def test_external_data_is_brought_along(tmp_path: Path) -> None:
+def test_a_model_is_replaced_whole(tmp_path: Path) -> None:
     artefact = _artefact(tmp_path / "x.onnx")
-    (tmp_path / "x.onnx.data").write_bytes(b"weights")
-    model = write_triton_repository(artefact, tmp_path / "repository", ModelCard("tiny"))
-    assert (model / "1" / "x.onnx.data").read_bytes() == b"weights"
+    repository = tmp_path / "repository"
+    model = write_triton_repository(artefact, repository, ModelCard("tiny"), name="mine")
+    (model / "2").mkdir()
+    with pytest.raises(OutputError, match="exists already"):
+        write_triton_repository(artefact, repository, ModelCard("tiny"), name="mine")
+    assert write_triton_repository(artefact, repository, ModelCard("base"), name="mine", overwrite=True) == model
+    assert [path.name for path in sorted(model.rglob("*"))] == ["1", "model.onnx", "config.pbtxt"]
+    assert [path.name for path in repository.iterdir()] == ["mine"]
 
 
-def test_mistakes_are_named(tmp_path: Path) -> None:
-    card = ModelCard("tiny")
-    with pytest.raises(WeightsError, match="no such file"):
-        write_triton_repository(tmp_path / "x.onnx", tmp_path, card)
-    with pytest.raises(ConfigError, match=r"\.onnx or \.xml"):
-        write_triton_repository(tmp_path / "x.safetensors", tmp_path, card)
+def test_a_broken_graph_is_named(tmp_path: Path) -> None:
     broken = tmp_path / "broken.onnx"
     broken.write_bytes(b"\xff\xfe\xfd no model")
     with pytest.raises(WeightsError, match="no ONNX model"):
-        write_triton_repository(broken, tmp_path, card)
-    artefact = _artefact(tmp_path / "x.onnx")
-    write_triton_repository(artefact, tmp_path / "repository", card)
-    with pytest.raises(OutputError, match="exists already"):
-        write_triton_repository(artefact, tmp_path / "repository", card)
+        write_triton_repository(broken, tmp_path / "repository", ModelCard("tiny"))
+    assert not (tmp_path / "repository").exists()

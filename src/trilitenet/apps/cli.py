@@ -170,6 +170,7 @@ def main(words: Sequence[str] | None = None) -> int:
     level = os.environ.get("TRILITENET_LOG", "WARNING").upper()
     known = isinstance(logging.getLevelName(level), int)  # of a name it gives the number
     logging.basicConfig(level=level if known else "WARNING", format="%(levelname)s %(name)s: %(message)s")
+    result: Any = None
     try:
         if not known:
             raise ConfigError(f"TRILITENET_LOG={level} is no level of a log; take DEBUG, INFO, WARNING or ERROR")
@@ -178,10 +179,12 @@ def main(words: Sequence[str] | None = None) -> int:
         app = build_app(words)
         with _heeding_sigterm():
             result = app(words, print_error=False, exit_on_error=False, verbose=False, result_action="return_value")
-        sys.stdout.write(_shown(result))
-        sys.stdout.flush()
-        for line in getattr(result, "errors", ()):
-            sys.stderr.write(f"error: {line}\n")
+        try:
+            sys.stdout.write(_shown(result))
+            sys.stdout.flush()
+        finally:
+            for line in getattr(result, "errors", ()):
+                sys.stderr.write(f"error: {line}\n")
     except _MisuseError as error:
         return _fail(str(error), code=2)
     except CycloptsError as error:
@@ -200,7 +203,6 @@ def main(words: Sequence[str] | None = None) -> int:
         return _fail("interrupted", code=130)
     except BrokenPipeError:  # the reader, such as `head`, has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     return int(getattr(result, "exit_code", 0))
 
 

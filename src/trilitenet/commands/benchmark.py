@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import os
 import platform
@@ -10,21 +11,24 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 import trilitenet
 from trilitenet.commands.load import load
-from trilitenet.commands.paths import text_paths
+from trilitenet.commands.paths import check_writable, text_paths
 from trilitenet.config import VARIANTS, check_size
-from trilitenet.errors import ConfigError, OutputError, import_extra, writing
+from trilitenet.errors import ConfigError, OutputError, import_extra, write_file
 from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.cores import usable_cores
 
 __all__ = ["Benchmark", "Cost", "Timing", "benchmark"]
+
+_PLOTS: Final = (".png", ".svg", ".pdf")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,7 +157,7 @@ def benchmark(
         table: latency, or cost: parameters and multiply-adds of the three variants, nothing timed.
         rounds: Timed calls an entry; every round calls each entry once.
         warmup: Calls before.
-        size: Height and width of the network's input, where a model takes any.
+        size: Height and width of the network's input, where a model takes any; --stage frame takes the longer side.
         source: Height and width of the image for --stage frame.
         device: auto, cpu, cuda.
         streams: Images OpenVINO computes at once; use with --batch of as many or more.
@@ -167,28 +171,41 @@ def benchmark(
     Raises:
         ConfigError: If there is nothing to measure, a number is not positive, or the size is not of multiples of 32.
         OutputError: If a file cannot be written.
+        MissingExtraError: If the extra ``evaluate`` is not installed, for a plot.
     """
+    if not backend or not batch:
+        raise ConfigError("nothing to measure: name at least one --backend and one --batch")
     if min(rounds, *batch) < 1 or warmup < 0:
         raise ConfigError("--rounds and --batch must be at least 1, --warmup not negative")
     if streams < 1 or (threads is not None and threads < 1):
         raise ConfigError(f"--streams and --threads must be at least 1, got {streams} and {threads}")
     check_size(size, "--size")
+    if min(source) < 1:
+        raise ConfigError(f"--source must be at least 1x1, got {source[0]}x{source[1]} (height x width)")
+    if table == "cost" and (models or plot is not None):
+        raise ConfigError("--table cost is of the three variants, and nothing is timed; leave models and --plot out")
+    if plot is not None and plot.suffix.lower() not in _PLOTS:
+        raise ConfigError(f"{plot}: --plot must end in {', '.join(_PLOTS)}")
+    for file in (output, plot):
+        if file is not None:
+            check_writable(file)
+    if plot is not None:
+        import_extra("matplotlib", "evaluate")
     machine = _machine(threads, streams)
-    if table == "cost":
-        result = Benchmark((), _costs(size), machine, 0, None)
-    else:
-        names = models or ("tiny",)
-        entries = [_Entry(name, one, device, streams, threads) for name in names for one in backend]
-        calls = [_Call(entry, count, stage, size, source) for entry in entries for count in batch]
-        result = Benchmark(_measure(calls, rounds, warmup), (), machine, rounds, _peak_memory())
-        if plot is not None:
+    with ExitStack() as stack:
+        calls: list[_Call] = []
+        if table == "cost":
+            result = Benchmark((), _costs(size), machine, 0, None)
+        else:
+            for name, one in itertools.product(models or ("tiny",), backend):
+                entry = _Entry(name, one, device, streams, threads)
+                stack.enter_context(entry.predictor)
+                calls += [_Call(entry, count, stage, size, source) for count in batch]
+            result = Benchmark(_measure(calls, rounds, warmup), (), machine, rounds, _peak_memory())
+        if output is not None:
+            write_file(output, json.dumps(result.to_dict(), indent=2) + "\n")
+        if plot is not None and calls:
             _plot(calls, plot)
-        for entry in entries:
-            entry.predictor.close()
-    if output is not None:
-        with writing(output):
-            output.parent.mkdir(parents=True, exist_ok=True)
-            output.write_text(json.dumps(result.to_dict(), indent=2) + "\n", encoding="utf-8")
     return result
 
 
@@ -218,6 +235,8 @@ class _Call:
             self.run: Callable[[], object] = lambda: predictor.backend.run(images)
         else:
             frames: list[NDArray[np.uint8]] = [generator.integers(0, 256, (*source, 3), np.uint8)] * batch
+            if predictor.backend.canvas is None:
+                predictor = Predictor(predictor.backend, predictor.thresholds, long_side=max(size))
             self.run = lambda: predictor.perceive(frames)
 
     def once(self) -> None:
@@ -339,7 +358,6 @@ def _peak_memory() -> int | None:
 
 
 def _plot(calls: Sequence[_Call], path: Path) -> None:
-    import_extra("matplotlib", "evaluate")
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 1 + 0.6 * len(calls)), layout="constrained")

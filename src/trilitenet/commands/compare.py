@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
-from trilitenet.commands.evaluate import check_counts
+from trilitenet.commands.evaluate import check_counts, check_output
 from trilitenet.commands.paths import text_paths
 from trilitenet.engine.compare import Comparison, compare_reports
 from trilitenet.engine.report import Report, read_report
-from trilitenet.errors import ConfigError, OutputError
+from trilitenet.errors import ConfigError
 
 __all__ = ["compare"]
 
@@ -41,8 +41,7 @@ def compare(
     if not reports:
         raise ConfigError("give at least one report.json, or a folder that holds one")
     check_counts(resamples)
-    if output is not None and not overwrite and (output / "comparison.json").exists():
-        raise OutputError(f"{output}: holds comparison.json already; give another folder or --overwrite")
+    check_output(output, overwrite, "comparison.json")
     files = [path / "report.json" if path.is_dir() else path for path in reports]
     repeated = [path for path, count in Counter(file.resolve() for file in files).items() if count > 1]
     if repeated:

@@ -29,7 +29,7 @@ from trilitenet.data.prepared import prepare as run_preparation
 from trilitenet.data.reading import IMAGE_FOLDER, DrivingDataset
 from trilitenet.data.records import RecordSource
 from trilitenet.data.sample import Sample
-from trilitenet.errors import ConfigError, DataError, OutputError, replacing, writing
+from trilitenet.errors import ConfigError, DataError, OutputError, write_file
 from trilitenet.formats.readers.bdd100k import read_bdd100k
 from trilitenet.formats.readers.coco import read_coco
 from trilitenet.formats.readers.cvat import read_cvat
@@ -230,10 +230,10 @@ def check(
         report = check_dataset(root, workers=_workers(workers), progress=advance)
     files: list[Path] = []
     if json_file is not None:
-        _write(json_file, json.dumps(report.to_dict(), indent=1, ensure_ascii=False))
+        write_file(json_file, json.dumps(report.to_dict(), indent=1, ensure_ascii=False))
         files.append(json_file)
     if html is not None:
-        _write(html, check_page(report, _some_pictures(report, pictures)))
+        write_file(html, check_page(report, _some_pictures(report, pictures)))
         files.append(html)
     return Checked(report, tuple(files))
 
@@ -315,7 +315,7 @@ def show(
             f"{name}: {len(indices)} of {len(dataset)}": _all_fitted(dataset, indices, max(width, 480))
             for name, (dataset, indices) in groups.items()
         }
-        _write(output, picture_page(f"{root.name} {' '.join(where)}".strip(), pictures))
+        write_file(output, picture_page(f"{root.name} {' '.join(where)}".strip(), pictures))
     else:
         samples = [dataset[index] for dataset, indices in groups.values() for index in indices]
         names = next(iter(groups.values()))[0].class_names
@@ -323,7 +323,7 @@ def show(
         done, data = cv2.imencode(output.suffix, cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
         if not done:
             raise OutputError(f"{output}: a sheet of {sheet.shape[1]}x{sheet.shape[0]} pixels cannot be encoded")
-        _write(output, data.tobytes())
+        write_file(output, data.tobytes())
     return Shown(output, shown)
 
 
@@ -469,7 +469,7 @@ def _some_pictures(report: CheckReport, count: int) -> Any:
     samples: list[Sample] = []
     names: tuple[str, ...] = ("vehicle",)
     for split, images in report.images.items():
-        if not images:
+        if not images or count < 1:
             continue
         dataset = DrivingDataset(report.root, split)
         names = dataset.class_names
@@ -494,18 +494,6 @@ def _fitted(dataset: DrivingDataset, index: int, width: int) -> Any:
 def _workers(workers: int) -> int:
     count = workers or usable_cores()
     return 0 if count == 1 else count
-
-
-def _write(path: Path, content: str | bytes) -> None:
-    """Write a file whole or not at all; what is a device or a link, such as /dev/stdout, stays what it is."""
-    data = content.encode() if isinstance(content, str) else content
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_symlink() or (path.exists() and not path.is_file()):
-            path.write_bytes(data)
-            return
-        with replacing(path) as part:
-            part.write_bytes(data)
 
 
 def _rendered(table: Table) -> str:

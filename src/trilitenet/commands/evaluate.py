@@ -12,8 +12,8 @@ from typing import Any, Final, Literal
 
 from trilitenet.commands.load import load
 from trilitenet.commands.paths import check_writable, text_paths
-from trilitenet.config import ArtefactInfo, shipped_weights
-from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER, DrivingDataset
+from trilitenet.config import ArtefactInfo, Task, shipped_weights
+from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.evaluate import EvaluatedPredictor
 from trilitenet.engine.evaluate import evaluate as run_evaluation
 from trilitenet.engine.predictions import PredictionWriter
@@ -104,11 +104,11 @@ def evaluate(
         lane=lane,
         long_side=long_side,
     )
-    _check_artefact(model, predictor, protocol)
     with predictor, ExitStack() as stack:
+        _check_artefact(model, predictor, protocol)
         dataset = DrivingDataset(data, split, class_names=predictor.card.class_names)
         if "detection" in predictor.card.tasks:
-            _warn_of_foreign(dataset)
+            warn_of_foreign(dataset)
         writer = None
         if save is not None:
             writer = stack.enter_context(PredictionWriter(save, predictor.card.tasks, overwrite=overwrite))
@@ -169,7 +169,7 @@ def _check_artefact(model: str, predictor: Predictor, protocol: str) -> None:
         )
 
 
-def _warn_of_foreign(dataset: DrivingDataset) -> None:
+def warn_of_foreign(dataset: DrivingDataset) -> None:
     """Warn if no box of the data set is of a class that the model knows."""
     if categories := dataset.foreign_categories():
         _LOGGER.warning(
@@ -195,9 +195,11 @@ def hash_model(model: str) -> str | None:
     path = shipped_weights().get(model) or Path(model)
     if path.is_dir():
         return hash_files(file for file in path.rglob("*") if file.is_file())
-    weights = path.with_suffix(".bin")  # OpenVINO keeps them beside the graph
-    if path.suffix == ".xml" and weights.is_file():
-        return hash_files([path, weights])
+    # OpenVINO and NCNN keep weights beside the graph, NCNN the card as well.
+    beside = {".xml": (".bin",), ".param": (".bin", ".json")}.get(path.suffix, ())
+    files = [file for file in map(path.with_suffix, beside) if file.is_file()]
+    if files and path.is_file():
+        return hash_files([path, *files])
     return hash_file(path) if path.is_file() else None
 
 
@@ -207,14 +209,19 @@ def hash_file(path: Path) -> str:
 
 
 def hash_dataset(dataset: DrivingDataset, limit: int | None = None) -> dict[str, str]:
-    """Return the SHA-256 of images, masks and boxes, apart, of the images that are measured on."""
-    names = dataset.names[:limit]
-    root, split = dataset.root, dataset.split
+    """Return the SHA-256 of images and of the labels of each task with what they mean, of the images measured on."""
+    names, about = dataset.names[:limit], dataset.description
+    own_car = [dataset.root / path for path in {about.ego_mask, *about.ego_masks.values()} if path]
+
+    def labels(task: Task) -> str:
+        files = hash_files([*(dataset.label_path(task, name) for name in names), *own_car])
+        return hashlib.sha256(f"{files} {dataset.meaning(task)}".encode()).hexdigest()
+
     return {
         "images": hash_files(dataset.image_path(index) for index in range(len(names))),
-        "drivable": hash_files(root / DRIVABLE_FOLDER / split / f"{name}.png" for name in names),
-        "lane": hash_files(root / LANE_FOLDER / split / f"{name}.png" for name in names),
-        "boxes": hash_files(root / DETECTION_FOLDER / split / f"{name}.json" for name in names),
+        "drivable": labels("drivable"),
+        "lane": labels("lane"),
+        "boxes": labels("detection"),
     }
 
 
@@ -231,16 +238,17 @@ def check_counts(resamples: int, worst: int = 0, limit: int | None = None) -> No
         raise ConfigError(f"--limit must be at least 1, got {limit}; leave it out for all images")
 
 
-def check_output(output: Path | None, overwrite: bool) -> None:
-    """Refuse, before hours of work, a folder that holds a report or cannot be written.
+def check_output(output: Path | None, overwrite: bool, name: str = "report.json") -> None:
+    """Refuse, before hours of work, a folder that holds a file of this name or cannot be written.
 
     Raises:
         OutputError: If it is so.
     """
-    if output is not None and not overwrite and (output / "report.json").exists():
-        raise OutputError(f"{output}: holds report.json already; give another folder or --overwrite")
-    if output is not None:
-        check_writable(output / "report.json")
+    if output is None:
+        return
+    if not overwrite and (output / name).exists():
+        raise OutputError(f"{output}: holds {name} already; give another folder or --overwrite")
+    check_writable(output / name)
 
 
 def write_report(report: Report, output: Path | None) -> None:

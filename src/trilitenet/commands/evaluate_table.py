@@ -23,7 +23,8 @@ from trilitenet.config import ARTEFACT_SUFFIXES
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.provenance import hash_files
 from trilitenet.engine.report import Report, read_report
-from trilitenet.errors import ConfigError, writing
+from trilitenet.errors import ConfigError, write_file
+from trilitenet.models.weights import read_card
 
 __all__ = ["PrecisionRow", "PrecisionTable", "evaluate_table"]
 
@@ -114,7 +115,7 @@ def evaluate_table(
     *models: str,
     data: Path,
     output: Path,
-    precisions: Sequence[Precision] = ("fp32", "fp16", "bf16", "int8"),
+    precisions: Sequence[Precision] | None = None,
     format: Literal["openvino", "onnx"] = "openvino",
     size: str = "384x640",
     split: str = "val",
@@ -133,7 +134,8 @@ def evaluate_table(
         models: Names of shipped weights, or weight files; tiny, small and base if left out.
         data: Root folder of a data set in the published layout.
         output: Folder for artefacts and reports.
-        precisions: fp32, fp16, bf16 (OpenVINO), int8; the others are compared with the first.
+        precisions: fp32, fp16, bf16 (OpenVINO), int8; all of the format's if left out. The others are compared with
+            the first.
         format: Runtime: openvino or onnx.
         size: HEIGHTxWIDTH of the input, the same for all.
         split: Split to measure on.
@@ -150,6 +152,7 @@ def evaluate_table(
         ConfigError: If there is no precision, the format lacks one, or there shall be no calibration frames.
         OutputError: If the output folder cannot be written to.
     """
+    precisions = PRECISIONS[format] if precisions is None else precisions
     if not precisions:
         raise ConfigError("name at least one of --precisions fp32 fp16 bf16 int8")
     for precision in precisions:
@@ -157,6 +160,8 @@ def evaluate_table(
             raise ConfigError(
                 f"{format} artefacts come as {', '.join(PRECISIONS[format])}; leave {precision} out of --precisions"
             )
+    if size == "dynamic" and "int8" in precisions:
+        raise ConfigError("int8 needs a fixed --size; give one, or leave int8 out of --precisions")
     if calibration_frames < 1:
         raise ConfigError(f"--calibration-frames must be at least 1, got {calibration_frames}")
     check_writable(output / "precisions.md")
@@ -164,9 +169,9 @@ def evaluate_table(
     if "int8" in precisions:
         int8 = f"-{calibration_frames}-{_hash_calibration(calibration or data, calibration_frames, max_drop)[:12]}"
         int8 += "" if max_drop is None else f"-drop{max_drop:g}"
-    data_hash = hash_dataset(DrivingDataset(data, split), limit)
     rows: list[PrecisionRow] = []
     for model in models or ("tiny", "small", "base"):
+        data_hash = hash_dataset(DrivingDataset(data, split, class_names=read_card(model).class_names), limit)
         stamp = (hash_model(model) or "")[:12]
         for precision in precisions:
             name = f"{Path(model).stem}-{stamp}-{size}-{precision}{int8 if precision == 'int8' else ''}"
@@ -202,8 +207,7 @@ def evaluate_table(
             figures = {key: figure.value for key, figure in report.figures.items()}
             rows.append(PrecisionRow(model, precision, report.provenance.runtime, figures))
     table = PrecisionTable(tuple(rows))
-    with writing(output / "precisions.md"):
-        (output / "precisions.md").write_text(table.summary() + "\n", encoding="utf-8")
+    write_file(output / "precisions.md", table.summary() + "\n")
     return table
 
 

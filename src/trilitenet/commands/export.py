@@ -19,9 +19,9 @@ from torch.nn.functional import interpolate
 
 import trilitenet
 from trilitenet.commands.paths import check_writable, text_paths
-from trilitenet.config import ARTEFACT_KEY, ARTEFACT_SUFFIXES, CARD_KEY, MAX_STRIDE, ArtefactInfo, Task, check_size
-from trilitenet.data.reading import DrivingDataset
-from trilitenet.deploy.graph import DeployGraph, Masks
+from trilitenet.config import ARTEFACT_KEY, ARTEFACT_SUFFIXES, CARD_KEY, ArtefactInfo, Task, check_size
+from trilitenet.data.reading import IMAGE_ENDINGS, DrivingDataset
+from trilitenet.deploy.graph import DeployGraph, Masks, Traceable
 from trilitenet.deploy.layouts import pick_layout
 from trilitenet.deploy.ncnn import build_ncnn, save_ncnn
 from trilitenet.deploy.onnx import build_onnx, save_onnx
@@ -33,6 +33,7 @@ from trilitenet.deploy.triton import write_triton_repository
 from trilitenet.engine.evaluate import evaluate
 from trilitenet.errors import BackendError, ConfigError, InputError, OutputError, did_you_mean, writing
 from trilitenet.inference.backend import Backend
+from trilitenet.inference.exported import prepare_input
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.torch_backend import TorchBackend
 from trilitenet.models.trilitenet import NetworkOutputs, TriLiteNet
@@ -55,7 +56,7 @@ Format = Literal["onnx", "openvino", "ncnn", "tensorrt", "torch", "triton"]
 Precision = Literal["fp32", "fp16", "bf16", "int8"]
 _Item = TypeVar("_Item")
 
-PRECISIONS = {
+PRECISIONS: Final[dict[str, tuple[Precision, ...]]] = {
     "onnx": ("fp32", "fp16", "int8"),
     "openvino": ("fp32", "fp16", "bf16", "int8"),
     "ncnn": ("fp32", "fp16"),
@@ -72,7 +73,6 @@ DROP_SCORES: Final[dict[Task, str]] = {
     "lane": "fair/lane/iou",
 }
 """Of which the largest drop counts."""
-_IMAGES = {".bmp", ".jpeg", ".jpg", ".png", ".webp"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,7 +133,7 @@ def export(
         output: File to write (for triton, the folder of the repository); by default named after the model, here.
         precision: fp32, fp16 (weights stored so; on Arm, NCNN computes so too), bf16 (OpenVINO) or int8 (needs
             --calibration).
-        size: HEIGHTxWIDTH of the input in multiples of 32, or dynamic (not ncnn).
+        size: HEIGHTxWIDTH of the input in multiples of 32, or dynamic (neither ncnn nor tensorrt).
         calibration: Frames for INT8: a data set in the published layout (its train split) or a folder of pictures.
         calibration_frames: At most so many of them.
         max_drop: INT8 may lose at most so many points of a score on the val split of --calibration; layers fall back
@@ -183,8 +183,7 @@ def export(
                 layout=layout,
                 frames=frames,
             )
-            with writing(path):
-                write_triton_repository(exported.path, path.parent, network.card, name=path.name, overwrite=overwrite)
+            write_triton_repository(exported.path, path.parent, network.card, name=path.name, overwrite=overwrite)
         serve = f"Serve it with: tritonserver --model-repository {path.parent.resolve()}"
         return dataclasses.replace(exported, path=path, notes=(*exported.notes, serve))
 
@@ -250,9 +249,11 @@ def _check_options(
         raise ConfigError(f"--calibration-frames must be at least 1, got {calibration_frames}")
     if max_drop is not None and precision != "int8":
         raise ConfigError("--max-drop is for --precision int8")
-    if portable and layout != "auto" and not layout.startswith("planar"):
+    if max_drop is not None and nms:
+        raise ConfigError("--max-drop measures the boxes that --nms drops; find what to keep without --nms")
+    if portable and layout not in ("auto", "planar"):
         raise ConfigError(f"--portable is planar, as are ncnn and tensorrt; leave --layout {layout} out")
-    if size is None and (precision == "int8" or format == "ncnn"):
+    if size is None and (precision == "int8" or format in ("ncnn", "tensorrt")):
         raise ConfigError(f"{'int8' if precision == 'int8' else format} needs a fixed --size")
     if portable and masks not in (None, "logit"):
         raise ConfigError(
@@ -266,7 +267,8 @@ def _destination(model: str, format: Format, output: Path | None) -> Path:
         return (output or Path("model_repository")) / Path(model).stem
     ending = ARTEFACT_SUFFIXES[format]
     path = output or Path(f"{Path(model).stem}{ending}")
-    if not path.name.endswith(ending) and not (format == "tensorrt" and path.name):
+    endings = (ending, ".onnx") if format == "tensorrt" else (ending,)
+    if not path.name.endswith(endings):
         raise ConfigError(f"{format} artefacts end with {ending}, not {path.suffix or 'nothing'}")
     return path
 
@@ -330,7 +332,7 @@ def find_pictures(source: Path, count: int, split: str) -> list[Path]:
         if split == "train" and (images / "val").is_dir():
             raise InputError(f"{source}: has no train split to calibrate on; give a folder of other pictures")
         folder = images if images.is_dir() else source  # a data set's masks are no pictures
-    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _IMAGES)
+    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_ENDINGS)
     if not paths:
         raise InputError(f"{source}: no pictures there")
     return _spread(paths, count)
@@ -345,13 +347,6 @@ def drop_frames(data: Path, class_names: Sequence[str] | None = None) -> Driving
 def _spread(items: Sequence[_Item], count: int) -> list[_Item]:
     chosen = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
     return [items[index] for index in chosen]
-
-
-def _as_input(canvas: NDArray[np.uint8], info: ArtefactInfo) -> NDArray[Any]:
-    image = canvas[:, :, ::-1] if info.colour == "bgr" else canvas
-    if info.input == "float_nchw":
-        return np.ascontiguousarray(image.transpose(2, 0, 1)[None], np.float32)
-    return np.ascontiguousarray(image[None])
 
 
 def _write(built: Any, path: Path, network: TriLiteNet, info: ArtefactInfo) -> None:
@@ -369,7 +364,8 @@ def _keep(
     """Write beside the destination, compare, and only then move into place."""
     with _trial(path) as trial:
         _write(built, trial, network, info)
-        parity = _compare(network, _open(trial, info), info, checks)
+        with contextlib.closing(_open(trial, info)) as backend:
+            parity = _compare(network, backend, info, checks)
         _require(parity, path)
     return Exported(path, info, parity)
 
@@ -500,7 +496,7 @@ def _export_int8(
 ) -> Exported:
     """Quantise, and leave more and more parts in floating point until no score loses more than ``max_drop`` points."""
     canvas = info.size or network.card.input_size
-    inputs = [_as_input(image, info) for image in _canvases(calibration, canvas, calibration_frames, split="train")]
+    inputs = [prepare_input(image, info) for image in _canvases(calibration, canvas, calibration_frames, split="train")]
     budget = None if max_drop is None else _Drop(network, info.size, calibration)
     quantize = quantize_openvino if info.format == "openvino" else quantize_onnx
     reason = ""
@@ -524,29 +520,16 @@ def _export_torch(
 ) -> Exported:
     from trilitenet.inference.exported_torch_backend import ExportedTorchBackend
 
-    class Outputs(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.network = graph
-
-        def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
-            return tuple(output for output in self.network(image) if output is not None)
-
-    height, width = info.size or network.card.input_size
-    image = torch.from_numpy(_as_input(np.zeros((height, width, 3), np.uint8), info))
-    dynamic = None
-    if info.size is None:
-        rows, columns = (MAX_STRIDE * torch.export.Dim(name, min=2, max=128) for name in ("rows", "columns"))
-        axis = 2 if info.input == "float_nchw" else 1
-        dynamic = ({axis: rows, axis + 1: columns},)
+    traceable = Traceable(graph, network.card, info)
     with torch.no_grad():
-        program = torch.export.export(Outputs().eval(), (image,), dynamic_shapes=dynamic)
+        program = torch.export.export(traceable, (traceable.image,), dynamic_shapes=traceable.dynamic)
     with _trial(path) as trial:
         metadata = {CARD_KEY: network.card.to_json(), ARTEFACT_KEY: info.to_json()}
         data = io.BytesIO()  # PyTorch aborts the process where it cannot write to a file
         torch.export.save(program, data, extra_files=metadata)
         trial.write_bytes(data.getbuffer())
-        parity = _compare(network, ExportedTorchBackend(trial, "cpu"), info, checks)
+        with contextlib.closing(ExportedTorchBackend(trial, "cpu")) as backend:
+            parity = _compare(network, backend, info, checks)
         _require(parity, path)
     return Exported(path, info, parity)
 
@@ -560,7 +543,8 @@ def _export_tensorrt(
 
         with _trial(path) as trial:
             trial.write_bytes(pack_engine(build_engine(proto, info.precision), network.card, info))
-            parity = _compare(network, TensorRTBackend(trial), info, checks)
+            with contextlib.closing(TensorRTBackend(trial)) as backend:
+                parity = _compare(network, backend, info, checks)
             _require(parity, path)
         return Exported(path, info, parity)
     onnx_path = _fallback(path)

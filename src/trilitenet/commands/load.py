@@ -71,9 +71,11 @@ def load(
     """
     if backend not in BACKENDS:
         raise ConfigError(f"unknown backend {backend!r}{did_you_mean(backend, BACKENDS)}")
+    if streams < 1 or (threads is not None and threads < 1):
+        raise ConfigError(f"streams and threads must be at least 1, got {streams} and {threads}")
     runtime = _open(model, device, backend, streams, threads)
-    thresholds = _override(runtime.card, confidence=confidence, iou=iou, drivable=drivable, lane=lane)
     try:
+        thresholds = _override(runtime.card, confidence=confidence, iou=iou, drivable=drivable, lane=lane)
         return Predictor(runtime, thresholds, long_side=long_side, batch_size=batch_size)
     except ConfigError as error:
         runtime.close()

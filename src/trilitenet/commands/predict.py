@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import logging
 import os
 import re
@@ -22,12 +23,22 @@ from rich.text import Text
 
 from trilitenet.commands.load import load
 from trilitenet.commands.paths import text_paths
-from trilitenet.errors import LONGEST_NAME, BackendError, InputError, OutputError, ShapeError, replacing, writing
+from trilitenet.errors import (
+    LONGEST_NAME,
+    BackendError,
+    InputError,
+    OutputError,
+    ShapeError,
+    free_name,
+    replacing,
+    writing,
+)
 from trilitenet.formats.writers.base import Writer, find_writer, open_writer
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, Failure, FrameReader, Stills, find_sources
 from trilitenet.inference.video import PerceptionStream, VideoWriter
 from trilitenet.processing.drawing import PARTS, check_parts, draw
+from trilitenet.processing.geometry import Camera
 from trilitenet.road.camera import read_camera
 from trilitenet.road.drawing import ROAD_PARTS, draw_road
 from trilitenet.road.monitor import RoadMonitor
@@ -67,8 +78,12 @@ class RoadOptions:
         steady = None
         if not still and (self.track or self.smoothing):
             steady = Steady(track=self.track, smoothing=self.smoothing)
-        camera = None if self.camera is None else read_camera(self.camera)
-        return steady, RoadMonitor(camera, still=still) if self.measure or camera is not None else None
+        return steady, RoadMonitor(self._mounted, still=still) if self.measure or self._mounted is not None else None
+
+    @functools.cached_property
+    def _mounted(self) -> Camera | None:
+        """The camera that the file describes."""
+        return None if self.camera is None else read_camera(self.camera)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -384,6 +399,7 @@ class _Job:
         total = len(source.paths) if isinstance(source, Stills) else source.expected
         task = progress.add_task(name, total=total)
         video: VideoWriter | None = None
+        before = self.frames
         with contextlib.ExitStack() as stack:
             if isinstance(source, FrameReader):
                 self.videos += 1
@@ -412,7 +428,7 @@ class _Job:
             except InputError as error:
                 assert isinstance(source, FrameReader)
                 self.failures.append(Failure(source.name, str(error)))
-                self.videos -= video is None or not video.frames
+                self.videos -= self.frames == before
         if video is not None and video.frames:
             self.files.append(video.path)
         progress.update(task, total=progress.tasks[task].completed)
@@ -475,13 +491,8 @@ def _allot_stems(names: Sequence[str]) -> dict[str, str]:
     stems: dict[str, str] = {}
     taken: set[str] = set()
     for name in dict.fromkeys(names):
-        stem = PurePath(name).stem or "image"
-        number, chosen = 1, stem
-        while chosen in taken:
-            number += 1
-            chosen = f"{stem}-{number}"
-        stems[name] = chosen
-        taken.add(chosen)
+        stems[name] = free_name(PurePath(name).stem or "image", taken)
+        taken.add(stems[name])
     return stems
 
 

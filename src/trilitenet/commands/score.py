@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from trilitenet.commands.evaluate import check_counts, check_output, hash_dataset, write_report
+from trilitenet.commands.evaluate import check_counts, check_output, hash_dataset, warn_of_foreign, write_report
 from trilitenet.commands.paths import text_paths
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.evaluate import score_predictions
@@ -14,6 +14,7 @@ from trilitenet.engine.predictions import DETECTIONS_FILE, SavedPredictions
 from trilitenet.engine.provenance import hash_files
 from trilitenet.engine.report import Report
 from trilitenet.engine.scorecard import CONDITIONS
+from trilitenet.errors import ConfigError
 
 __all__ = ["score"]
 
@@ -57,13 +58,17 @@ def score(
         The report.
 
     Raises:
-        ConfigError: If a count is negative.
+        ConfigError: If a count is negative, or the confidence out of range.
         OutputError: If there is a report already.
     """
     check_counts(resamples, worst, limit)
+    if not 0 <= confidence <= 1:
+        raise ConfigError(f"--confidence must be in [0, 1], got {confidence}")
     check_output(output, overwrite)
     dataset = DrivingDataset(data, split, class_names=tuple(classes))
     saved = SavedPredictions(predictions, classes)
+    if "detection" in saved.tasks:
+        warn_of_foreign(dataset)
     report = score_predictions(
         saved,
         dataset,

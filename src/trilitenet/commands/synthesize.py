@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
+from rich.console import Console
 from rich.progress import track
 
 from trilitenet.commands.paths import text_paths
@@ -59,7 +60,7 @@ def synthesize(
     Raises:
         OutputError: If the split is there already.
     """
-    steps = iter(track(range(count), "scenes", transient=True))
+    steps = iter(track(range(count), "scenes", transient=True, console=Console(stderr=True)))
 
     def advance(done: int) -> None:
         del done

@@ -21,24 +21,25 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from trilitenet.commands.evaluate import warn_of_foreign
 from trilitenet.commands.paths import text_paths
 from trilitenet.config import DEFAULT_ANCHORS, ModelCard
+from trilitenet.data.contact_sheet import as_perception
 from trilitenet.data.identity import identify
 from trilitenet.data.loader import build_loader
 from trilitenet.data.prepared import PreparedDataset, is_prepared, open_dataset
 from trilitenet.data.reading import DrivingDataset, MixedDataset, SampleSource, sampling_weights
-from trilitenet.data.sample import Sample
 from trilitenet.data.transforms import TrainTransform, Transform
 from trilitenet.engine.anchors import box_sizes, fit_anchors
 from trilitenet.engine.evaluate import evaluate
 from trilitenet.engine.lessons import Lessons, TaughtTransform
-from trilitenet.engine.loggers import build_loggers
+from trilitenet.engine.loggers import build_loggers, check_loggers
 from trilitenet.engine.recipe import TrainConfig, merge, read_recipe
 from trilitenet.engine.results import write_results
 from trilitenet.engine.runtime import follow, running_fabric
 from trilitenet.engine.train import CHECKPOINT_NAME, Trainer, TrainResult, holds_run
 from trilitenet.engine.transfer import freeze, initialise
-from trilitenet.errors import ConfigError, DataError, OutputError, TriLiteNetError
+from trilitenet.errors import ConfigError, DataError, OutputError, TriLiteNetError, import_extra
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.torch_backend import TorchBackend
 from trilitenet.losses.detection import DetectionLoss
@@ -47,10 +48,10 @@ from trilitenet.losses.multitask import MultiTaskLoss
 from trilitenet.losses.segmentation import SegmentationLoss
 from trilitenet.models.trilitenet import TriLiteNet, build_network
 from trilitenet.models.weights import load_network
-from trilitenet.structures import Boxes, Perception
 
 __all__ = ["build_loss", "train", "training_data", "validation_figures"]
 
+_LOGGER: Final = logging.getLogger(__name__)
 _YAML_FLAGS: Final = ("anchors", "sampling", "extra_data")
 """Fields whose flag takes YAML, for example --sampling '{timeofday: {night: 2}}'."""
 
@@ -84,6 +85,9 @@ def train(
             f"{config.data}: is prepared, and figures are measured on images as they are; give the data set that it "
             "was made of (a copy in its .prepared is used by itself), or --val-split '' to go without"
         )
+    check_loggers(config.loggers)
+    if "csv" in config.loggers:  # whose curves the page of results has
+        import_extra("matplotlib", "train")
     with running_fabric(
         config.device,
         config.precision,
@@ -100,6 +104,7 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
     torch.manual_seed(config.seed)
     with _Display(quiet=not fabric.is_global_zero) as display:
         dataset = training_data(config)
+        _check_labels(config, dataset)
         loader = build_loader(
             dataset,
             _transform(config, dataset, display),
@@ -186,12 +191,34 @@ def training_data(config: TrainConfig) -> SampleSource:
     return MixedDataset([(first, 1.0), *more])
 
 
+def _parts(dataset: SampleSource) -> list[SampleSource]:
+    return [part for part, _ in dataset.parts] if isinstance(dataset, MixedDataset) else [dataset]
+
+
+def _check_labels(config: TrainConfig, dataset: SampleSource) -> None:
+    """Warn of tasks that no image is labelled for, and of classes that no box is of.
+
+    Raises:
+        DataError: If there are no labels at all, and no teacher.
+    """
+    parts = [part for part in _parts(dataset) if isinstance(part, (DrivingDataset, PreparedDataset))]
+    without = [task for task in config.tasks if not any(part.has_labels(task) for part in parts)]
+    if set(without) == set(config.tasks) and config.teacher is None:
+        raise DataError(f"{config.data}: no image of {config.train_split} is labelled for {', '.join(without)}")
+    if without and config.teacher is None:
+        _LOGGER.warning("%s: no image of %s is labelled for %s", config.data, config.train_split, ", ".join(without))
+    if "detection" in config.tasks:
+        for part in parts:
+            if isinstance(part, DrivingDataset):
+                warn_of_foreign(part)
+
+
 def _transform(config: TrainConfig, dataset: SampleSource, display: _Display) -> Transform:
     """Build the training transform, with a teacher's saved outputs as targets if there is a folder of them."""
     plain = TrainTransform(config.input_size, config.augmentation)
     if config.teacher is None or not Path(config.teacher).is_dir():
         return plain
-    parts = [part for part, _ in dataset.parts] if isinstance(dataset, MixedDataset) else [dataset]
+    parts = _parts(dataset)
     lessons = Lessons(
         Path(config.teacher),
         dataset.class_names,
@@ -281,9 +308,11 @@ def _teacher(config: TrainConfig, network: TriLiteNet) -> tuple[TriLiteNet, Dist
     teacher = load_network(config.teacher)
     if not set(teacher.tasks) & set(network.tasks):
         raise ConfigError(f"{config.teacher}: the teacher has none of the tasks {', '.join(network.tasks)}")
-    classes = len(teacher.card.class_names), len(network.card.class_names)
-    if "detection" in teacher.tasks and "detection" in network.tasks and classes[0] != classes[1]:
-        raise ConfigError(f"{config.teacher}: the teacher tells {classes[0]} classes, the data set has {classes[1]}")
+    told, wanted = teacher.card.class_names, network.card.class_names
+    if "detection" in teacher.tasks and "detection" in network.tasks and told != wanted:
+        raise ConfigError(
+            f"{config.teacher}: the teacher tells the classes {', '.join(told)}, the data set has {', '.join(wanted)}"
+        )
     return teacher, DistillationLoss(network.anchors, teacher.anchors, config.distillation)
 
 
@@ -313,22 +342,8 @@ def _pictures(
     """Draw labels and predictions of images spread evenly over a data set."""
     for index in np.linspace(0, len(dataset) - 1, min(count, len(dataset))).astype(int):
         sample = dataset[int(index)]
-        labels = _as_perception(sample, tuple(dataset.class_names))
+        labels = as_perception(sample, dataset.class_names)
         yield sample.name, labels.draw(), predictor(sample.image).draw(sample.image)
-
-
-def _as_perception(sample: Sample, class_names: tuple[str, ...]) -> Perception:
-    boxes = None
-    if sample.boxes is not None and sample.class_id is not None:
-        boxes = Boxes(sample.boxes, np.ones(len(sample.boxes), np.float32), sample.class_id)
-    return Perception(
-        size=sample.size,
-        class_names=class_names,
-        boxes=boxes,
-        drivable=None if sample.drivable is None else sample.drivable.astype(np.bool_),
-        lane=None if sample.lane is None else sample.lane.astype(np.bool_),
-        image=sample.image,
-    )
 
 
 class _Display:
@@ -414,7 +429,7 @@ def _nested(fields: Mapping[str, Any]) -> dict[str, Any]:
         if name in _YAML_FLAGS and isinstance(value, str):
             try:
                 value = yaml.safe_load(value)
-            except yaml.YAMLError as error:
+            except (yaml.YAMLError, ValueError) as error:  # the latter of a date that there is not
                 raise ConfigError(f"--{name.replace('__', '.')}: not YAML ({' '.join(str(error).split())})") from error
         first, *inner = name.split("__")
         for part in reversed(inner):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from pathlib import Path
 from typing import Any, Final
 
@@ -57,11 +58,13 @@ class TableResult:
         title: Of the table.
         rows: In the paper's order.
         finished: False if a run was stopped; its row and those after it are missing.
+        first: Whether this is the first of the runs' processes, which alone tells of them.
     """
 
     title: str
     rows: tuple[TableRow, ...]
     finished: bool
+    first: bool = True
 
     @property
     def exit_code(self) -> int:
@@ -69,7 +72,9 @@ class TableResult:
         return 0 if self.finished else 130
 
     def summary(self) -> str:
-        """Return the table in Markdown."""
+        """Return the table in Markdown; nothing for a process that is not the first."""
+        if not self.first:
+            return ""
         head = ("Method", *_HEADINGS, "Params (M)", "Multiply-adds (G)")
         lines = [
             self.title if self.finished else f"{self.title} (stopped; go on with --resume)",
@@ -104,23 +109,28 @@ def train_table(table: Path, /, *, data: Path, output: Path, resume: bool = Fals
     title, recipes = _read(table)
     try:
         more = yaml.safe_load(settings) if settings else {}
-    except yaml.YAMLError:
+    except (yaml.YAMLError, ValueError):  # the latter of a date that there is not
         more = None
-    if not isinstance(more, dict) or {"data", "output"} & more.keys():
-        raise ConfigError(f"settings must be YAML such as '{{epochs: 10}}', without data and output, got {settings!r}")
-    fields: dict[str, Any] = {**more, "data": str(data)}
+    if not isinstance(more, dict) or {"data", "output"} & more.keys() or None in more.values():
+        raise ConfigError(
+            f"settings must be YAML such as '{{epochs: 10}}', without data and output, and no null, got {settings!r}"
+        )
+    fields: dict[str, Any] = {str(name): value for name, value in more.items()} | {"data": str(data)}
     for recipe in recipes.values():
+        config = read_recipe(recipe, fields)
         folder = output / recipe.stem
         if (folder / _WEIGHTS).is_file():
-            _check_done(folder, read_recipe(recipe, fields))
+            _check_done(folder, config)
     rows: list[TableRow] = []
+    first = True
     for name, recipe in recipes.items():
         folder = output / recipe.stem
         weights = folder / _WEIGHTS
         finished = weights.is_file()
         if not finished:
             going_on = resume and (folder / CHECKPOINT_NAME).is_file()
-            finished = train(recipe, resume=going_on, overwrite=not going_on, **fields, output=str(folder)).finished
+            result = train(recipe, resume=going_on, overwrite=not going_on, **fields, output=str(folder))
+            finished, first = result.finished, result.first
         if not finished:
             break
         network = load_network(weights)
@@ -128,7 +138,7 @@ def train_table(table: Path, /, *, data: Path, output: Path, resume: bool = Fals
         rows.append(
             TableRow(name, figures, count_parameters(network), count_multiply_adds(network, network.card.input_size))
         )
-    return TableResult(title, tuple(rows), len(rows) == len(recipes))
+    return TableResult(title, tuple(rows), len(rows) == len(recipes), first)
 
 
 def _check_done(folder: Path, config: TrainConfig) -> None:
@@ -165,6 +175,10 @@ def _read(table: Path) -> tuple[str, dict[str, Path]]:
     content = read_yaml(table)
     try:
         rows = {str(name): table.parent / str(recipe) for name, recipe in content["rows"].items()}
-        return str(content["title"]), rows
+        title = str(content["title"])
     except (KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{table}: must hold a title and rows of 'name: recipe' ({brief(error)})") from error
+    twice = [stem for stem, count in Counter(recipe.stem for recipe in rows.values()).items() if count > 1]
+    if twice:
+        raise ConfigError(f"{table}: two recipes are called {twice[0]!r}, and would share a folder; rename one")
+    return title, rows

@@ -15,7 +15,7 @@ from trilitenet.config import ModelCard, check_size, parse, read_yaml
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.evaluate import best_thresholds
 from trilitenet.engine.evaluate import evaluate as run_evaluation
-from trilitenet.errors import OutputError
+from trilitenet.errors import ConfigError, OutputError
 from trilitenet.models.weights import import_published, load_network, read_card, resolve_weights, save_network
 
 __all__ = ["CardText", "finish", "import_weights", "info"]
@@ -96,13 +96,15 @@ def finish(
         The card written into the file.
 
     Raises:
-        ConfigError: If the input size is not of multiples of 32.
+        ConfigError: If the input size is not of multiples of 32, or the batch size below 1.
         OutputError: If the destination exists already, or cannot be written.
     """
     if destination.exists() and not overwrite:
         raise OutputError(f"{destination}: exists already; give another name or --overwrite")
     if input_size is not None:
         check_size(input_size, "--input-size")
+    if batch_size < 1:
+        raise ConfigError(f"--batch-size must be at least 1, got {batch_size}")
     network = load_network(source)
     described = _describe(network.card, [_read_card_text(path) for path in card])
     if input_size is not None:
@@ -114,10 +116,10 @@ def finish(
     try:
         # Measured as stored: what the user loads is what the figures are of.
         save_network(network, draft, dataclasses.replace(described, metrics={}), half=not full)
-        predictor = load(draft)
-        best = best_thresholds(predictor, dataset, batch_size=batch_size)
-        predictor.thresholds = best.thresholds
-        report = run_evaluation(predictor, dataset, batch_size=batch_size, resamples=0, worst=0)
+        with load(draft) as predictor:
+            best = best_thresholds(predictor, dataset, batch_size=batch_size)
+            predictor.thresholds = best.thresholds
+            report = run_evaluation(predictor, dataset, batch_size=batch_size, resamples=0, worst=0)
         figures = {f"{split} {name}": round(figure.value, 4) for name, figure in report.figures.items()}
         finished = dataclasses.replace(described, thresholds=best.thresholds, metrics=figures)
         save_network(network, destination, finished, half=not full)

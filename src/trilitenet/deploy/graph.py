@@ -7,13 +7,13 @@ sums inside ESP blocks, no transposed convolution at the end (where the layout i
 
 from __future__ import annotations
 
-from typing import Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from trilitenet.config import STRIDES, Thresholds
+from trilitenet.config import MAX_STRIDE, STRIDES, ArtefactInfo, ModelCard, Thresholds
 from trilitenet.deploy.layers import (
     Activation,
     DepthwiseESPGraph,
@@ -55,7 +55,7 @@ from trilitenet.models.detection import DetectionHead, LitePAN
 from trilitenet.models.segmentation import SegmentationHead, UpStage
 from trilitenet.models.trilitenet import TriLiteNet
 
-__all__ = ["MASKS", "DeployGraph", "DeployOutputs", "Masks"]
+__all__ = ["MASKS", "DeployGraph", "DeployOutputs", "Masks", "Traceable"]
 
 Masks = Literal["decision", "probability", "logit"]
 """What a mask holds: 0 or 1, probability x 255, or foreground minus background logit minus the threshold's."""
@@ -547,3 +547,33 @@ class DeployGraph(nn.Module):
         batch, height, width, _ = image.shape
         x = image.reshape(batch, height, -1).float() * self.scale.repeat(width) + self.shift.repeat(width)
         return x.view(batch, height, width, 3).permute(0, 3, 1, 2)
+
+
+class Traceable(nn.Module):
+    """The deploy graph as exporters trace it: the outputs of absent tasks left out, with an image to trace it by.
+
+    Args:
+        graph: The deploy graph.
+        card: What the network is.
+        info: How the artefact takes pixels; its ``size`` of None makes height and width dynamic.
+
+    Attributes:
+        image: Zeros of the artefact's size, else of the card's, in the artefact's layout.
+        dynamic: Which sides may be of any size, as `torch.export.export` takes it; None if none.
+    """
+
+    def __init__(self, graph: DeployGraph, card: ModelCard, info: ArtefactInfo) -> None:
+        super().__init__()
+        self.network = graph
+        height, width = info.size or card.input_size
+        floats = info.input == "float_nchw"
+        self.image = torch.zeros(1, 3, height, width) if floats else torch.zeros(1, height, width, 3, dtype=torch.uint8)
+        self.dynamic: tuple[dict[int, Any]] | None = None
+        if info.size is None:
+            rows, columns = (MAX_STRIDE * torch.export.Dim(name, min=2, max=128) for name in ("rows", "columns"))
+            self.dynamic = ({2: rows, 3: columns} if floats else {1: rows, 2: columns},)
+        self.eval()
+
+    def forward(self, image: Tensor) -> tuple[Tensor, ...]:
+        """Run the graph."""
+        return tuple(output for output in self.network(image) if output is not None)

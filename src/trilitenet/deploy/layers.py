@@ -131,11 +131,7 @@ def recolumn(x: Tensor, before: int, after: int) -> Tensor:
 
     Channels-last it is a view: the same bytes, read as fewer and wider pixels, or as more and narrower ones.
     """
-    if before == after:
-        return x
-    batch, channels, height, width = x.shape
-    x = x.permute(0, 2, 3, 1).reshape(batch, height, width * before // after, channels // before * after)
-    return x.permute(0, 3, 1, 2)
+    return x if before == after else _rows(x, before, after).permute(0, 3, 1, 2)
 
 
 def concatenate(maps: Sequence[Tensor], columns: int) -> Tensor:
@@ -145,9 +141,13 @@ def concatenate(maps: Sequence[Tensor], columns: int) -> Tensor:
     """
     if columns == 1:
         return torch.cat(tuple(maps), 1)
-    batch, _, height, width = maps[0].shape
-    rows = [x.permute(0, 2, 3, 1).reshape(batch, height, width * columns, x.shape[1] // columns) for x in maps]
-    return torch.cat(rows, 3).permute(0, 3, 1, 2)
+    return torch.cat([_rows(x, columns, 1) for x in maps], 3).permute(0, 3, 1, 2)
+
+
+def _rows(x: Tensor, before: int, after: int) -> Tensor:
+    """Return a map's rows, (B, H, width, channels), in cells of ``after`` columns instead of ``before``."""
+    batch, channels, height, width = x.shape
+    return x.permute(0, 2, 3, 1).reshape(batch, height, width * before // after, channels // before * after)
 
 
 class FusedConv(nn.Module):

@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import torch
-from torch import Tensor, nn
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, WEIGHTS_HASH_KEY, ArtefactInfo, ModelCard
-from trilitenet.deploy.graph import DeployGraph
+from trilitenet.deploy.graph import DeployGraph, Traceable
 from trilitenet.errors import BackendError, import_extra
 
 __all__ = ["NcnnModel", "build_ncnn", "save_ncnn"]
@@ -38,17 +37,6 @@ class NcnnModel(NamedTuple):
     weights: bytes
 
 
-class _Planes(nn.Module):
-    """The deploy graph with the outputs of absent tasks left out."""
-
-    def __init__(self, graph: DeployGraph) -> None:
-        super().__init__()
-        self.network = graph
-
-    def forward(self, image: Tensor) -> tuple[Tensor, ...]:
-        return tuple(output for output in self.network(image) if output is not None)
-
-
 def build_ncnn(graph: DeployGraph, card: ModelCard, info: ArtefactInfo) -> NcnnModel:
     """Convert the deploy graph.
 
@@ -63,16 +51,16 @@ def build_ncnn(graph: DeployGraph, card: ModelCard, info: ArtefactInfo) -> NcnnM
     """
     assert info.size is not None
     pnnx = import_extra("pnnx", "ncnn")
-    image = torch.zeros(1, 3, *info.size)
+    traceable = Traceable(graph, card, info)
     with tempfile.TemporaryDirectory(prefix="trilitenet-ncnn-") as name:
         folder = Path(name)
         with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")  # a trace is what pnnx reads; PyTorch would rather it read something newer
-            torch.jit.trace(_Planes(graph).eval(), (image,), check_trace=False).save(str(folder / "graph.pt"))
+            torch.jit.trace(traceable, (traceable.image,), check_trace=False).save(str(folder / "graph.pt"))
         command = [
             pnnx.EXEC_PATH,
             "graph.pt",
-            f"inputshape=[{','.join(map(str, image.shape))}]",
+            f"inputshape=[{','.join(map(str, traceable.image.shape))}]",
             f"fp16={int(info.precision == 'fp16')}",
         ]
         try:

@@ -14,10 +14,9 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from torch import Tensor, nn
 
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY, MAX_STRIDE, ArtefactInfo, ModelCard, Thresholds
-from trilitenet.deploy.graph import DeployGraph
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard, Thresholds
+from trilitenet.deploy.graph import DeployGraph, Traceable
 from trilitenet.errors import BackendError, import_extra
 
 __all__ = ["OPSET", "PORTABLE_OPERATORS", "build_onnx", "save_onnx"]
@@ -32,17 +31,6 @@ PORTABLE_OPERATORS: Final = frozenset(
 )  # fmt: skip
 """All that a portable graph uses, on tensors of at most four dimensions: operators that TensorRT, TFLite converters,
 NCNN and vendor compilers share."""
-
-
-class _Named(nn.Module):
-    """The deploy graph with the outputs of absent tasks left out."""
-
-    def __init__(self, graph: DeployGraph) -> None:
-        super().__init__()
-        self.network = graph
-
-    def forward(self, image: Tensor) -> tuple[Tensor, ...]:
-        return tuple(output for output in self.network(image) if output is not None)
 
 
 def build_onnx(
@@ -67,23 +55,17 @@ def build_onnx(
     """
     onnx = import_extra("onnx", "onnx")
     import_extra("onnxscript", "onnx")
-    height, width = info.size or card.input_size
-    floats = info.input == "float_nchw"
-    image = torch.zeros(1, 3, height, width) if floats else torch.zeros(1, height, width, 3, dtype=torch.uint8)
-    dynamic = None
-    if info.size is None:
-        rows, columns = (MAX_STRIDE * torch.export.Dim(name, min=2, max=128) for name in ("rows", "columns"))
-        dynamic = ({2: rows, 3: columns} if floats else {1: rows, 2: columns},)
+    traceable = Traceable(graph, card, info)
     try:
         with _quiet():
             program = torch.onnx.export(
-                _Named(graph).eval(),
-                (image,),
+                traceable,
+                (traceable.image,),
                 dynamo=True,
                 opset_version=OPSET,
                 input_names=["image"],
                 output_names=list(card.tasks),
-                dynamic_shapes=dynamic,
+                dynamic_shapes=traceable.dynamic,
                 verbose=False,
             )
             assert program is not None

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from trilitenet.processing.boxes import box_iou, cxcywh_to_xyxy
 from trilitenet.structures import RawOutputs
 
 __all__ = ["TOLERANCES", "Parity", "Tolerance", "compare"]
@@ -134,8 +135,8 @@ def _match(
 ) -> tuple[int, int, list[float]]:
     """Return how many of the confident rows of ``wanted`` have a like row in ``offered``, of how many, and how far off.
 
-    A row must be clearly above the threshold on one side, and need only be near it on the other: rows at the very
-    threshold are decided by rounding.
+    Like is a row of the same most probable class with much the same box. A row must be clearly above the threshold on
+    one side, and need only be near it on the other: rows at the very threshold are decided by rounding.
     """
     scores = wanted[:, 4] * wanted[:, 5:].max(1)
     best = np.argsort(-scores, kind="stable")[:LIMIT]
@@ -143,13 +144,11 @@ def _match(
     near = offered[offered[:, 4] * offered[:, 5:].max(1) > confidence - 0.05]
     if not len(sure) or not len(near):
         return 0, len(sure), []
-    a, b = (np.concatenate((x[:, :2] - x[:, 2:4] / 2, x[:, :2] + x[:, 2:4] / 2), 1) for x in (sure, near))
-    overlap = np.clip(np.minimum(a[:, None, 2:], b[None, :, 2:]) - np.maximum(a[:, None, :2], b[None, :, :2]), 0, None)
-    shared = overlap.prod(2)
-    areas = sure[:, 2:4].prod(1)[:, None] + near[:, 2:4].prod(1)[None] - shared
-    iou = shared / np.maximum(areas, 1e-9)
+    a, b = cxcywh_to_xyxy(sure[:, :4]), cxcywh_to_xyxy(near[:, :4])
+    same = sure[:, 5:].argmax(1)[:, None] == near[:, 5:].argmax(1)[None]
+    iou = np.where(same, box_iou(a, b), 0)
     nearest = iou.argmax(1)
-    sides = np.abs(a[:, None] - b[None]).max(2)
+    sides = np.where(same, np.abs(a[:, None] - b[None]).max(2), np.inf)
     good = (iou.max(1) >= 0.9) | (sides.min(1) < 0.5)  # specks have no meaningful IoU
     nearest = np.where(iou.max(1) >= 0.9, nearest, sides.argmin(1))
     return int(good.sum()), len(sure), np.abs(a - b[nearest]).mean(1)[good].tolist()

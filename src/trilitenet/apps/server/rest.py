@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import functools
 import io
 import json
 import re
@@ -63,11 +62,12 @@ def rest_router(service: Service) -> APIRouter:
     async def predict_batch(request: Request, confidence: Confidence = None) -> Response:
         """See several images. One that is broken does not spoil the others: each has a status of its own."""
         images = await _all_images(request, service, request.scope["state"]["reservation"])
-        finish = functools.partial(_to_mapping, service=service)
         with service.admit(len(images)) as deadline:
             jobs = [
-                _settle(service.see(i, deadline, finish, confidence), service) if isinstance(i, Encoded) else _as_is(i)
-                for i in images
+                _settle(service.see(image, deadline, _to_mapping, confidence), service)
+                if isinstance(image, Encoded)
+                else _as_is(image)
+                for image in images
             ]
             results = await until_vanished(request, asyncio.gather(*jobs))
         if all(result["status"] == 503 for result in results):
@@ -192,7 +192,7 @@ def _finisher(output: Format, request: Request, service: Service) -> Callable[[O
     about = _about(request, service)
     if output == "json":
         return lambda outcome: Response(
-            _to_json({**about, **_to_mapping(outcome, service)}),
+            _to_json({**about, **_to_mapping(outcome)}),
             media_type="application/json",
             headers=_server_timing(outcome),
         )
@@ -221,7 +221,7 @@ def _about(request: Request, service: Service) -> dict[str, Any]:
     return {"request_id": request.scope["state"]["request_id"], "model": service.name}
 
 
-def _to_mapping(outcome: Outcome, service: Service) -> dict[str, Any]:
+def _to_mapping(outcome: Outcome) -> dict[str, Any]:
     return {"status": 200, "milliseconds": outcome.milliseconds, "perception": outcome.perception.to_dict()}
 
 
