@@ -6,7 +6,8 @@
     print(writer.files)
 
 Memory stays flat over any number of frames, unless a format's own layout forbids it (said where it does). A file gets
-its final name when it is whole: until then it ends in ``.part``.
+its final name when it is whole: until then it ends in ``.part``. JSON lines and CSV, which are whole after each line,
+have theirs from the beginning.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ class Writer(abc.ABC):
         overwrite: Replace files that exist.
 
     Attributes:
-        files: The files that are whole so far.
+        files: The files that are whole so far, those that grow by whole lines among them.
     """
 
     FILES: ClassVar[tuple[str, ...]] = ()
