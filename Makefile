@@ -16,7 +16,9 @@ JOBS ?= 2
 PYTEST_ARGS ?=
 DEMO ?= demo-output
 
-# Compiling modules that are never imported takes pip half of its time; Python compiles what it imports.
+# Compiling modules that are never imported takes pip half of its time; Python compiles what it imports, and keeps that
+# unless PYTHONDONTWRITEBYTECODE, which images of containers like to set, has every process do it anew.
+unexport PYTHONDONTWRITEBYTECODE
 INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile
 RUNTIME := $(VENV)/.installed-runtime
 DEVELOP := $(VENV)/.installed-develop
