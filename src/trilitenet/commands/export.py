@@ -440,14 +440,14 @@ class _Suppressed:
     def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
         from trilitenet.processing.boxes import cxcywh_to_xyxy
         from trilitenet.processing.nms import nms
+        from trilitenet.processing.postprocess import judge
 
         raw = self._backend.run(batch)
         if raw.detection is None:
             return raw
         thresholds = self._backend.card.thresholds
         rows = raw.detection[0]
-        class_id = rows[:, 5:].argmax(1)
-        scores = rows[:, 4] * rows[:, 5:].max(1)
+        class_id, scores = judge(rows)
         above = scores > thresholds.confidence
         rows, class_id, scores = rows[above], class_id[above], scores[above]
         kept = nms(cxcywh_to_xyxy(rows[:, :4]), scores, class_id, thresholds.iou, thresholds.max_boxes)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.processing.boxes import box_iou, cxcywh_to_xyxy
+from trilitenet.processing.postprocess import judge
 from trilitenet.structures import RawOutputs
 
 __all__ = ["TOLERANCES", "Parity", "Tolerance", "compare"]
@@ -138,14 +139,14 @@ def _match(
     Like is a row of the same most probable class with much the same box. A row must be clearly above the threshold on
     one side, and need only be near it on the other: rows at the very threshold are decided by rounding.
     """
-    scores = wanted[:, 4] * wanted[:, 5:].max(1)
+    scores = judge(wanted)[1]
     best = np.argsort(-scores, kind="stable")[:LIMIT]
     sure = wanted[best[scores[best] > confidence + 0.05]]
-    near = offered[offered[:, 4] * offered[:, 5:].max(1) > confidence - 0.05]
+    near = offered[judge(offered)[1] > confidence - 0.05]
     if not len(sure) or not len(near):
         return 0, len(sure), []
     a, b = cxcywh_to_xyxy(sure[:, :4]), cxcywh_to_xyxy(near[:, :4])
-    same = sure[:, 5:].argmax(1)[:, None] == near[:, 5:].argmax(1)[None]
+    same = judge(sure)[0][:, None] == judge(near)[0][None]
     iou = np.where(same, box_iou(a, b), 0)
     nearest = iou.argmax(1)
     sides = np.where(same, np.abs(a[:, None] - b[None]).max(2), np.inf)

@@ -125,7 +125,27 @@ class ImageOutcome:
     missed: int = 0
 
 
-class FairMetrics:
+class _ByTask:
+    """Metrics of up to three tasks; None for one that is not scored."""
+
+    detection: Any
+    drivable: Any
+    lane: Any
+
+    def figures(self, weights: NDArray[Any] | None = None) -> dict[str, NDArray[np.float64]]:
+        """Return scores by name, ``task/figure``, under R weightings of the images at once (see the metrics)."""
+        return {
+            f"{task}/{name}": value
+            for task, metric in self._by_task().items()
+            for name, value in metric.figures(weights).items()
+        }
+
+    def _by_task(self) -> dict[Task, Any]:
+        metrics: dict[Task, Any] = {"detection": self.detection, "drivable": self.drivable, "lane": self.lane}
+        return {task: metric for task, metric in metrics.items() if metric is not None}
+
+
+class FairMetrics(_ByTask):
     """The 'fair' protocol: native resolution, one confusion matrix over the data set, COCO matching.
 
     Args:
@@ -183,14 +203,6 @@ class FairMetrics:
             lane=None if self.lane is None else self.lane.compute(),
         )
 
-    def figures(self, weights: NDArray[Any] | None = None) -> dict[str, NDArray[np.float64]]:
-        """Return scores by name, ``task/figure``, under R weightings of the images at once (see the metrics)."""
-        return _gather(self._by_task(), weights)
-
-    def _by_task(self) -> dict[Task, Any]:
-        metrics: dict[Task, Any] = {"detection": self.detection, "drivable": self.drivable, "lane": self.lane}
-        return {task: metric for task, metric in metrics.items() if metric is not None}
-
     def state(self) -> dict[str, Any]:
         """Return what was kept of each image, as ``json.dumps`` takes it."""
         return {task: metric.state() for task, metric in self._by_task().items()}
@@ -242,7 +254,7 @@ class CanvasPrediction:
     letterbox: Letterbox
 
 
-class PaperMetrics:
+class PaperMetrics(_ByTask):
     """The 'paper' protocol: the published evaluation, with its averages over batches.
 
     Args:
@@ -292,14 +304,6 @@ class PaperMetrics:
             lane=None if self.lane is None else self.lane.compute(),
         )
 
-    def figures(self, weights: NDArray[Any] | None = None) -> dict[str, NDArray[np.float64]]:
-        """Return scores by name, ``task/figure``, under R weightings of the images at once (see the metrics)."""
-        return _gather(self._by_task(), weights)
-
-    def _by_task(self) -> dict[Task, Any]:
-        metrics: dict[Task, Any] = {"detection": self.detection, "drivable": self.drivable, "lane": self.lane}
-        return {task: metric for task, metric in metrics.items() if metric is not None}
-
     def state(self) -> dict[str, Any]:
         """Return what was kept of each image, as ``json.dumps`` takes it."""
         return {"batch_size": self.batch_size} | {task: metric.state() for task, metric in self._by_task().items()}
@@ -315,9 +319,3 @@ class PaperMetrics:
         if "lane" in state:
             metrics.lane = PublishedSegmentation.from_state(state["lane"])
         return metrics
-
-
-def _gather(metrics: dict[Task, Any], weights: NDArray[Any] | None) -> dict[str, NDArray[np.float64]]:
-    return {
-        f"{task}/{name}": value for task, metric in metrics.items() for name, value in metric.figures(weights).items()
-    }

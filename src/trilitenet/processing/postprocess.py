@@ -14,7 +14,7 @@ from trilitenet.processing.letterbox import Letterbox
 from trilitenet.processing.nms import nms
 from trilitenet.structures import Boxes, Perception, RawOutputs
 
-__all__ = ["select_boxes", "threshold_mask", "to_perceptions"]
+__all__ = ["judge", "select_boxes", "threshold_mask", "to_perceptions"]
 
 
 def to_perceptions(
@@ -56,6 +56,12 @@ def to_perceptions(
     ]
 
 
+def judge(rows: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Return the (N,) most probable classes of (N, 5 + classes) rows, and objectness x their probability."""
+    class_id = rows[:, 5:].argmax(axis=1)
+    return class_id, rows[:, 4] * np.take_along_axis(rows[:, 5:], class_id[:, None], axis=1)[:, 0]
+
+
 def select_boxes(detection: NDArray[np.float32], letterbox: Letterbox, thresholds: Thresholds) -> Boxes:
     """Pick the boxes of one image.
 
@@ -71,8 +77,7 @@ def select_boxes(detection: NDArray[np.float32], letterbox: Letterbox, threshold
         Boxes in pixels of the source image, clipped to it, best first; those wholly in the padding are gone.
     """
     candidates = detection[detection[:, 4] > thresholds.confidence]
-    class_id = candidates[:, 5:].argmax(axis=1)
-    scores = candidates[:, 4] * np.take_along_axis(candidates[:, 5:], class_id[:, None], axis=1)[:, 0]
+    class_id, scores = judge(candidates)
     keep = scores > thresholds.confidence
     candidates, class_id, scores = candidates[keep], class_id[keep], scores[keep]
     xyxy = cxcywh_to_xyxy(candidates[:, :4])
