@@ -16,10 +16,7 @@ JOBS ?= 2
 PYTEST_ARGS ?=
 DEMO ?= demo-output
 
-# Compiling modules that are never imported takes pip half of its time; Python compiles what it imports, and keeps that
-# unless PYTHONDONTWRITEBYTECODE, which images of containers like to set, has every process do it anew.
-unexport PYTHONDONTWRITEBYTECODE
-INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile
+PIP := $(BIN)/python -m pip --disable-pip-version-check
 RUNTIME := $(VENV)/.installed-runtime
 DEVELOP := $(VENV)/.installed-develop
 DOCUMENT := $(VENV)/.installed-docs
@@ -75,14 +72,14 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }
 
 $(RUNTIME): pyproject.toml | $(BIN)/python
-	$(INSTALL) "$(TORCH)"
-	$(INSTALL) --editable ".[video]"
+	$(PIP) install --quiet "$(TORCH)"
+	$(PIP) install --quiet --editable ".[video]"
 	@touch $@
 
 $(DEVELOP): $(RUNTIME)
-	$(INSTALL) --editable ".[all,dev]"
+	$(PIP) install --quiet --editable ".[all,dev]"
 	@touch $@
 
 $(DOCUMENT): $(RUNTIME)
-	$(INSTALL) --editable ".[docs]"
+	$(PIP) install --quiet --editable ".[docs]"
 	@touch $@

@@ -67,11 +67,15 @@ def settings(scenes: Path, output: Path, **more: Any) -> dict[str, Any]:
         "val_split": "",
         "device": "cpu",
         "precision": "32-true",
-        "loggers": ("csv",),
+        "loggers": (),  # with csv, a page of results is drawn, too
         "log_every": 1,
         "auto_anchor": False,
         **more,
     }
+
+
+def logged(scenes: Path, output: Path, **more: Any) -> dict[str, Any]:
+    return settings(scenes, output, **{"loggers": ("csv",), **more})
 
 
 def state(folder: Path) -> dict[str, Any]:
@@ -104,9 +108,9 @@ def curves(folder: Path) -> list[tuple[int, str, float]]:
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")  # two workers on a machine of one core
 def test_resume_is_bit_for_bit(scenes: Path, tmp_path: Path) -> None:
     options = {"workers": 2, "multi_scale": (0.8, 1.6), "precision": "auto", "balancing": "uncertainty"}
-    train(**settings(scenes, tmp_path / "straight", max_steps=20, **options))
+    train(**logged(scenes, tmp_path / "straight", max_steps=20, **options))
     for steps in (9, 20):  # two steps an epoch: step 9 is in the middle of one
-        result = train(resume=steps > 9, **settings(scenes, tmp_path / "parts", max_steps=steps, **options))
+        result = train(resume=steps > 9, **logged(scenes, tmp_path / "parts", max_steps=steps, **options))
         assert result.steps == steps
     same(state(tmp_path / "straight"), state(tmp_path / "parts"))
     assert curves(tmp_path / "straight") == curves(tmp_path / "parts")
@@ -168,7 +172,7 @@ def test_going_on_with_other_frozen_parts_is_refused(scenes: Path, tmp_path: Pat
 
 
 def test_the_losses_of_every_step_are_logged(scenes: Path, tmp_path: Path) -> None:
-    train(**settings(scenes, tmp_path, max_steps=5, log_every=3))  # two steps an epoch
+    train(**logged(scenes, tmp_path, max_steps=5, log_every=3))  # two steps an epoch
     assert [step for step, name, _ in read_csv(tmp_path / "metrics.csv") if name == "lr"] == [2, 3, 4, 5]
 
 
@@ -199,7 +203,7 @@ def test_pixels_reach_the_network_unrounded_in_bf16(
 
 def test_accumulation_sees_the_same_images(scenes: Path, tmp_path: Path) -> None:
     for passes in (1, 2):
-        train(**settings(scenes, tmp_path / str(passes), max_steps=1, accumulate=passes))
+        train(**logged(scenes, tmp_path / str(passes), max_steps=1, accumulate=passes))
     losses = [{row[1]: row[2] for row in read_csv(tmp_path / str(n) / "metrics.csv")} for n in (1, 2)]
     assert losses[0]["train/objectness"] == pytest.approx(losses[1]["train/objectness"], rel=0.05)
 
@@ -221,14 +225,14 @@ def test_a_signal_saves_and_ends_cleanly(
             subprocess.run(["kill", f"-{number.value}", *processes], check=True)  # as a terminal or scheduler does
 
     monkeypatch.setattr(CsvLogger, "log", log)
-    result = train(**settings(scenes, tmp_path, max_steps=6, workers=workers))
+    result = train(**logged(scenes, tmp_path, max_steps=6, workers=workers))
     assert (result.finished, result.steps, result.exit_code) == (False, 3, 130)
     assert "--resume" in result.summary()
     assert state(tmp_path)["step"] == 3
     assert not result.weights.exists()
     assert signal.getsignal(number) == before
     monkeypatch.setattr(CsvLogger, "log", plain)
-    assert train(resume=True, **settings(scenes, tmp_path, max_steps=6, workers=workers)).finished
+    assert train(resume=True, **logged(scenes, tmp_path, max_steps=6, workers=workers)).finished
 
 
 @pytest.mark.parametrize("last", [2, 4])
@@ -245,9 +249,9 @@ def test_a_stop_in_the_last_step_of_an_epoch_loses_no_validation(
 
     monkeypatch.setattr(CsvLogger, "log", log)
     options = {"val_split": "val", "max_steps": 4, "pictures": 0}
-    assert not train(**settings(scenes, tmp_path / "parts", **options)).finished
-    parts = train(resume=True, **settings(scenes, tmp_path / "parts", **options))
-    straight = train(**settings(scenes, tmp_path / "straight", **options))
+    assert not train(**logged(scenes, tmp_path / "parts", **options)).finished
+    parts = train(resume=True, **logged(scenes, tmp_path / "parts", **options))
+    straight = train(**logged(scenes, tmp_path / "straight", **options))
     assert parts.finished
     assert parts.metrics == straight.metrics
     assert read_card(parts.weights).metrics == read_card(straight.weights).metrics
@@ -293,7 +297,7 @@ def test_files_of_ones_own_are_left_alone(scenes: Path, tmp_path: Path) -> None:
 
 def test_validation_keeps_the_best_and_the_page(scenes: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    options = settings(scenes, tmp_path, val_split="val", epochs=1, max_steps=2, auto_anchor=True, pictures=1)
+    options = logged(scenes, tmp_path, val_split="val", epochs=1, max_steps=2, auto_anchor=True, pictures=1)
     result = trilitenet.train(**options)
     assert set(result.best) <= {"detection", "drivable", "lane", "overall"}
     assert {"detection/ap50", "detection/recall", "drivable/miou", "lane/accuracy", "lane/iou"} <= set(result.metrics)
@@ -329,7 +333,7 @@ def test_overwriting_leaves_nothing_of_the_earlier_run(
     values = iter([0.9, 0.1, 0.2])
     monkeypatch.setattr("trilitenet.commands.train.validation_figures", lambda *_: {"drivable/miou": next(values)})
     output = tmp_path / "run"
-    options = settings(scenes, output, val_split="val", tasks=("drivable",), pictures=0)
+    options = logged(scenes, output, val_split="val", tasks=("drivable",), pictures=0)
     train(**options, max_steps=2)
     assert (output / "best-drivable.safetensors").exists()
     (output / "results" / "old.jpg").write_bytes(b"x")
@@ -383,7 +387,7 @@ def test_distils_from_saved_outputs(scenes: Path, tmp_path: Path, capsys: pytest
                 sample.name,
                 Perception(size=sample.size, class_names=("vehicle",), boxes=said, drivable=drivable, lane=lane),
             )
-    plain = settings(scenes, tmp_path / "labels", max_steps=2)
+    plain = logged(scenes, tmp_path / "labels", max_steps=2)
     train(**plain)
     taught = {**plain, "data": str(images), "output": str(tmp_path / "taught"), "teacher": str(teacher)}
     result = train(**taught)
@@ -417,13 +421,13 @@ def test_not_finite_steps_are_left_out_and_end_the_run(
         return plain(self, image * float("nan") if next(calls) in poisoned else image)
 
     monkeypatch.setattr(TriLiteNet, "forward", forward)
-    result = train(**settings(scenes, tmp_path / "one", max_steps=3))
+    result = train(**logged(scenes, tmp_path / "one", max_steps=3))
     assert result.finished
     assert "step 1 skipped" in caplog.text
     assert all(bool(value.isfinite().all()) for value in load_network(result.weights).state_dict().values())
     poisoned.update(range(100))
     with pytest.raises(TrainingError, match="10 steps in a row"):
-        train(**settings(scenes, tmp_path / "all"))
+        train(**logged(scenes, tmp_path / "all"))
 
 
 def test_refusals(scenes: Path, tmp_path: Path) -> None:
@@ -529,7 +533,7 @@ def test_an_image_that_vanishes_or_breaks_is_named_and_the_run_can_go_on(
                 path.write_bytes(b"broken")
 
     monkeypatch.setattr(CsvLogger, "log", log)
-    options = settings(data, tmp_path / "run", workers=workers, max_steps=30, samples_per_epoch=400)
+    options = logged(data, tmp_path / "run", workers=workers, max_steps=30, samples_per_epoch=400)
     with pytest.raises(DataError, match=r"train/synthetic_\w+\.jpg: .*; once that is mended, --resume") as caught:
         train(**options)
     assert "\n" not in str(caught.value)
@@ -569,7 +573,7 @@ def test_a_reading_process_that_is_killed_is_told_in_one_line(
 
     monkeypatch.setattr(CsvLogger, "log", log)
     with pytest.raises(TrainingError, match=r"reads images was ended .*--workers .*--resume") as caught:
-        train(**settings(scenes, tmp_path, max_steps=30, workers=1, samples_per_epoch=400))
+        train(**logged(scenes, tmp_path, max_steps=30, workers=1, samples_per_epoch=400))
     assert "\n" not in str(caught.value)
 
 
@@ -669,7 +673,7 @@ def test_two_processes_follow_one(scenes: Path, tmp_path: Path) -> None:
     """Same batches of four, whole or two and two; batch statistics and the region of Tversky are a process's own."""
     curves = {}
     for devices in (1, 2):
-        config = settings(scenes, tmp_path / str(devices), max_steps=6, devices=devices, lr=1e-3)
+        config = logged(scenes, tmp_path / str(devices), max_steps=6, devices=devices, lr=1e-3)
         recipe = tmp_path / f"{devices}.yaml"
         recipe.write_text(
             yaml.safe_dump({key: list(value) if isinstance(value, tuple) else value for key, value in config.items()})
