@@ -16,7 +16,10 @@ JOBS ?= 2
 PYTEST_ARGS ?=
 DEMO ?= demo-output
 
-PIP := $(BIN)/python -m pip --disable-pip-version-check
+INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile
+# On all cores, where pip compiles on one; some packages hold files for other versions of Python.
+COMPILE := $(BIN)/python -m compileall -q -j 0 $(VENV)/lib > /dev/null 2>&1 || true
+PYTORCH := $(VENV)/.installed-pytorch
 RUNTIME := $(VENV)/.installed-runtime
 DEVELOP := $(VENV)/.installed-develop
 DOCUMENT := $(VENV)/.installed-docs
@@ -71,15 +74,21 @@ $(BIN)/python:
 		exit 1; }
 	$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }
 
-$(RUNTIME): pyproject.toml | $(BIN)/python
-	$(PIP) install --quiet "$(TORCH)"
-	$(PIP) install --quiet --editable ".[video]"
+$(PYTORCH): | $(BIN)/python
+	$(INSTALL) "$(TORCH)"
 	@touch $@
 
-$(DEVELOP): $(RUNTIME)
-	$(PIP) install --quiet --editable ".[all,dev]"
+$(RUNTIME): pyproject.toml $(PYTORCH)
+	$(INSTALL) --editable ".[video]"
+	@$(COMPILE)
 	@touch $@
+
+$(DEVELOP): pyproject.toml $(PYTORCH)
+	$(INSTALL) --editable ".[all,dev]"
+	@$(COMPILE)
+	@touch $(RUNTIME) $@
 
 $(DOCUMENT): $(RUNTIME)
-	$(PIP) install --quiet --editable ".[docs]"
+	$(INSTALL) --editable ".[docs]"
+	@$(COMPILE)
 	@touch $@
