@@ -170,13 +170,16 @@ def evaluate_table(
         int8 = f"-{calibration_frames}-{_hash_calibration(calibration or data, calibration_frames, max_drop)[:12]}"
         int8 += "" if max_drop is None else f"-drop{max_drop:g}"
     rows: list[PrecisionRow] = []
+    hashes: dict[tuple[str, ...], dict[str, str]] = {}  # the classes decide what labels mean
     for model in models or ("tiny", "small", "base"):
-        data_hash = hash_dataset(DrivingDataset(data, split, class_names=read_card(model).class_names), limit)
+        classes = read_card(model).class_names
+        if classes not in hashes:
+            hashes[classes] = hash_dataset(DrivingDataset(data, split, class_names=classes), limit)
         stamp = (hash_model(model) or "")[:12]
         for precision in precisions:
             name = f"{Path(model).stem}-{stamp}-{size}-{precision}{int8 if precision == 'int8' else ''}"
             artefact = output / f"{name}{ARTEFACT_SUFFIXES[format]}"
-            report = None if overwrite else _done(output / name / "report.json", artefact, data_hash)
+            report = None if overwrite else _done(output / name / "report.json", artefact, hashes[classes])
             if report is None:
                 if overwrite or not artefact.exists():
                     export(

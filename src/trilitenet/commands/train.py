@@ -25,7 +25,7 @@ from trilitenet.commands.evaluate import warn_of_foreign
 from trilitenet.commands.paths import text_paths
 from trilitenet.config import DEFAULT_ANCHORS, ModelCard
 from trilitenet.data.contact_sheet import as_perception
-from trilitenet.data.identity import identify
+from trilitenet.data.identity import identify, parts_of
 from trilitenet.data.loader import build_loader
 from trilitenet.data.prepared import PreparedDataset, is_prepared, open_dataset
 from trilitenet.data.reading import DrivingDataset, MixedDataset, SampleSource, sampling_weights
@@ -191,22 +191,20 @@ def training_data(config: TrainConfig) -> SampleSource:
     return MixedDataset([(first, 1.0), *more])
 
 
-def _parts(dataset: SampleSource) -> list[SampleSource]:
-    return [part for part, _ in dataset.parts] if isinstance(dataset, MixedDataset) else [dataset]
-
-
 def _check_labels(config: TrainConfig, dataset: SampleSource) -> None:
     """Warn of tasks that no image is labelled for, and of classes that no box is of.
 
     Raises:
         DataError: If there are no labels at all, and no teacher.
     """
-    parts = [part for part in _parts(dataset) if isinstance(part, (DrivingDataset, PreparedDataset))]
-    without = [task for task in config.tasks if not any(part.has_labels(task) for part in parts)]
-    if set(without) == set(config.tasks) and config.teacher is None:
-        raise DataError(f"{config.data}: no image of {config.train_split} is labelled for {', '.join(without)}")
-    if without and config.teacher is None:
-        _LOGGER.warning("%s: no image of %s is labelled for %s", config.data, config.train_split, ", ".join(without))
+    parts = list(parts_of(dataset))
+    if config.teacher is None:
+        without = [task for task in config.tasks if not any(part.has_labels(task) for part in parts)]
+        reason = f"{config.data}: no image of {config.train_split} is labelled for {', '.join(without)}"
+        if set(without) == set(config.tasks):
+            raise DataError(reason)
+        if without:
+            _LOGGER.warning(reason)
     if "detection" in config.tasks:
         for part in parts:
             if isinstance(part, DrivingDataset):
@@ -218,7 +216,7 @@ def _transform(config: TrainConfig, dataset: SampleSource, display: _Display) ->
     plain = TrainTransform(config.input_size, config.augmentation)
     if config.teacher is None or not Path(config.teacher).is_dir():
         return plain
-    parts = _parts(dataset)
+    parts = list(parts_of(dataset))
     lessons = Lessons(
         Path(config.teacher),
         dataset.class_names,
@@ -227,7 +225,7 @@ def _transform(config: TrainConfig, dataset: SampleSource, display: _Display) ->
     )
     if not set(lessons.tasks) & set(config.tasks):
         raise ConfigError(f"{config.teacher}: the teacher has none of the tasks {', '.join(config.tasks)}")
-    names = {name for part in parts for name in getattr(part, "names", ())}
+    names = {name for part in parts for name in part.names}
     taught = len(names & lessons.names())
     if not taught:
         raise ConfigError(f"{config.teacher}: none of the {len(names)} training images is among the saved outputs")

@@ -11,7 +11,7 @@ import numpy as np
 from trilitenet.data.prepared import PreparedDataset
 from trilitenet.data.reading import DrivingDataset, MixedDataset, SampleSource
 
-__all__ = ["identify", "tell_apart"]
+__all__ = ["identify", "parts_of", "tell_apart"]
 
 _LOOKED_AT: Final = 64
 """So many samples, spread evenly over a data set, are looked at."""
@@ -20,7 +20,7 @@ _LOOKED_AT: Final = 64
 def identify(dataset: SampleSource) -> dict[str, Any]:
     """Return classes, and of each part number, names and a sample of the content, as plain values."""
     parts = []
-    for part in _parts(dataset):
+    for part in parts_of(dataset):
         chosen = np.unique(np.linspace(0, len(part) - 1, min(_LOOKED_AT, len(part))).astype(int))
         parts.append(
             {
@@ -59,9 +59,10 @@ def tell_apart(before: Mapping[str, Any], now: Mapping[str, Any], *, strict: boo
     return None
 
 
-def _parts(dataset: SampleSource) -> Iterator[DrivingDataset | PreparedDataset]:
+def parts_of(dataset: SampleSource) -> Iterator[DrivingDataset | PreparedDataset]:
+    """Yield the data sets on disk that a source of samples is made of."""
     if isinstance(dataset, MixedDataset):
         for part, _ in dataset.parts:
-            yield from _parts(part)
+            yield from parts_of(part)
     elif isinstance(dataset, (DrivingDataset, PreparedDataset)):
         yield dataset

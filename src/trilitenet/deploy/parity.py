@@ -139,14 +139,16 @@ def _match(
     Like is a row of the same most probable class with much the same box. A row must be clearly above the threshold on
     one side, and need only be near it on the other: rows at the very threshold are decided by rounding.
     """
-    scores = judge(wanted)[1]
+    class_id, scores = judge(wanted)
     best = np.argsort(-scores, kind="stable")[:LIMIT]
-    sure = wanted[best[scores[best] > confidence + 0.05]]
-    near = offered[judge(offered)[1] > confidence - 0.05]
+    best = best[scores[best] > confidence + 0.05]
+    other_class, other_scores = judge(offered)
+    around = other_scores > confidence - 0.05
+    sure, near = wanted[best], offered[around]
     if not len(sure) or not len(near):
         return 0, len(sure), []
     a, b = cxcywh_to_xyxy(sure[:, :4]), cxcywh_to_xyxy(near[:, :4])
-    same = judge(sure)[0][:, None] == judge(near)[0][None]
+    same = class_id[best][:, None] == other_class[around][None]
     iou = np.where(same, box_iou(a, b), 0)
     nearest = iou.argmax(1)
     sides = np.where(same, np.abs(a[:, None] - b[None]).max(2), np.inf)

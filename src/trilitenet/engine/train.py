@@ -48,9 +48,6 @@ _TRACES: Final = ("config.yaml", "metrics.csv", "results", "tensorboard")
 FIGURES: Final = {"detection": "detection/ap50", "drivable": "drivable/miou", "lane": "lane/iou"}
 """The figure each task is judged by; the mean of these is the overall one."""
 
-GUARD_INTERVAL: Final = 20
-"""On a GPU, so many steps pass between two looks at whether they were finite."""
-
 SAME_ON_RESUME: Final = (
     "variant",
     "tasks",
@@ -190,10 +187,10 @@ class Trainer:
         self.loss = loss
         self.teacher = teacher and tuple(part.to(fabric.device).eval() for part in teacher)
         self.ema = MovingAverage(self.network, config.ema_decay, config.ema_ramp) if config.ema_decay else None
-        followers = [] if self.ema is None else [self.ema.network]
-        self.guard = FiniteGuard(
-            [self.network, *followers], optimiser, GUARD_INTERVAL if fabric.device.type == "cuda" else 1
-        )
+        interval = 20 if fabric.device.type == "cuda" else 1
+        # The average follows no bad step that is seen at once.
+        followers = [] if self.ema is None or interval == 1 else [self.ema.network]
+        self.guard = FiniteGuard([self.network, *followers], optimiser, interval)
 
         self.epoch_steps = len(loader) // config.accumulate
         if not self.epoch_steps:

@@ -101,9 +101,11 @@ class LabelMapping:
     def __post_init__(self) -> None:
         if self.tasks:
             check_tasks(self.tasks)
-        paths = (("images", self.images, ("split",)),)
-        masks = (("drivable_mask", self.drivable_mask), ("lane_mask", self.lane_mask))
-        for name, path, known in (*paths, *((name, rule.path, ("split", "name")) for name, rule in masks)):
+        for name, path, known in (
+            ("images", self.images, ("split",)),
+            ("drivable_mask", self.drivable_mask.path, ("split", "name")),
+            ("lane_mask", self.lane_mask.path, ("split", "name")),
+        ):
             try:
                 path.format(**dict.fromkeys(known, ""))
             except (LookupError, ValueError) as error:

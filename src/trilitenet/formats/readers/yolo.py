@@ -89,10 +89,11 @@ class YoloSource:
             except (ValueError, OverflowError) as error:
                 raise DataError(f"{path}, line {number}: not numbers ({error})") from error
             coordinates = values[:4] if len(values) in (4, 5) else values
-            if not (np.abs(coordinates) <= _BEYOND).all():
+            wrong = coordinates[~(np.abs(coordinates) <= _BEYOND)]  # what is no number, too
+            if len(wrong):
                 raise DataError(
-                    f"{path}, line {number}: {coordinates[~(np.abs(coordinates) <= _BEYOND)][0]:g} is no coordinate in "
-                    "[0, 1]; divide pixels by the image's size, and leave the numbers of tracks out"
+                    f"{path}, line {number}: {wrong[0]:g} is no coordinate in [0, 1]; "
+                    "divide pixels by the image's size, and leave the numbers of tracks out"
                 )
             if len(values) in (4, 5):
                 centre, extent = values[:2] * scale, values[2:4] * scale
