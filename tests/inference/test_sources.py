@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import functools
 import http.server
 import io
@@ -531,3 +532,17 @@ def test_a_link_to_nothing_is_told(tmp_path: Path) -> None:
         (item,) = source
         assert isinstance(item, Failure)
         assert "gone.jpg" in item.reason
+
+
+def test_standard_input_is_opened_once_though_its_first_frame_is_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = []
+
+    def container(path: str, *_: Any, **__: Any) -> Any:
+        opened.append(path)
+        return contextlib.nullcontext()
+
+    late = [(time, functools.partial(shade, i)) for i, time in enumerate((0.1, 0.2))]
+    monkeypatch.setattr("trilitenet.inference.sources._open_container", container)
+    monkeypatch.setattr("trilitenet.inference.sources._frames_of", lambda *_: iter(late))
+    assert [frame.timestamp for frame in VideoReader("-")] == [0.1, 0.2]
+    assert opened == ["-"]

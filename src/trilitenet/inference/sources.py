@@ -247,9 +247,10 @@ class VideoReader(FrameReader):
         return _open_container(self._path, self.name, timeout=self._timeout)
 
     def _decode(self) -> Any:
-        found = True
+        astray = False
         with self._open() as container:
-            if self.clip.start and self._path != "-":
+            sought = bool(self.clip.start) and self._path != "-"
+            if sought:
                 stream = container.streams.video[0]
                 first = stream.start_time or 0
                 with contextlib.suppress(_av().FFmpegError):  # what cannot seek is read from its beginning
@@ -257,12 +258,12 @@ class VideoReader(FrameReader):
             frames = _frames_of(container, self)
             for timestamp, make in itertools.islice(frames, 1):
                 self._skipped = round(timestamp * (self.rate or 0))  # 0 but after a seek
-                found = timestamp <= self.clip.start + _SLACK
-                if found:
+                astray = sought and timestamp > self.clip.start + _SLACK
+                if not astray:
                     yield timestamp, make
-            if found:
+            if not astray:
                 yield from frames
-        if not found:  # as in recordings one after the other, whose time stamps begin anew
+        if astray:  # as in recordings one after the other, whose time stamps begin anew
             self._skipped = 0
             with self._open() as container:
                 yield from _frames_of(container, self)
