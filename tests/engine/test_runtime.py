@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import platform
 import signal
 import socket
 import subprocess
@@ -163,11 +164,27 @@ def test_no_process_outlives_the_first(tmp_path: Path, script: Path, *, meets: b
     assert ended(int(told.read_text()))
 
 
-@pytest.mark.parametrize(("native", "warned"), [(True, False), (False, True)])
+@pytest.mark.parametrize(
+    ("machine", "native", "kernels", "warned"),
+    [
+        ("x86_64", True, True, False),
+        ("x86_64", False, True, True),  # AVX-512 without bf16, where PyTorch's kernels emulate it
+        ("AMD64", False, False, True),
+        ("aarch64", False, True, False),
+        ("aarch64", False, False, True),
+    ],
+)
 def test_bf16_without_instructions_for_it_is_told(
-    native: bool, warned: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    machine: str,
+    native: bool,
+    kernels: bool,
+    warned: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: native)
+    monkeypatch.setattr(platform, "machine", lambda: machine)
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: native)
+    monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: kernels)
     with runtime.running_fabric("cpu", "bf16-mixed"):
         assert ("--precision 32-true" in caplog.text) == warned
     caplog.clear()
