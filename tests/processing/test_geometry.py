@@ -33,6 +33,19 @@ def test_signs_of_pitch_and_yaw(angle: str, axis: int, sign: int) -> None:
     assert moved[axis] * sign > 20
 
 
+def test_a_strong_lens_there_and_back() -> None:
+    lens = (0.2, 0.1, 0.0, 0.0, 0.002, 0.55, 0.15, 0.01)
+    camera = Camera((720, 1280), 370.0, 370.0, 639.5, 359.5, 1.4, 0.05, distortion=lens)
+    pixels = np.array([[5.0, 715.0], [1270.0, 700.0], [640.0, 600.0]])
+    np.testing.assert_allclose(camera.to_pixels(camera.to_ground(pixels)), pixels, atol=0.01)
+
+
+def test_pixels_that_a_lens_cannot_show_are_not_on_the_road() -> None:
+    camera = Camera((720, 1280), 448.0, 448.0, 639.5, 359.5, 1.4, 0.05, distortion=(-0.25, 0.06, 0.0, 0.0, -0.006))
+    ground = camera.to_ground([[100.0, 500.0], [1160.0, 600.0], [640.0, 600.0]])
+    assert np.isnan(ground).all(axis=1).tolist() == [True, True, False]
+
+
 def test_roll_lowers_the_right_side_of_the_camera() -> None:
     rolled = dataclasses.replace(Camera.from_field_of_view((480, 640), 60.0, 1.5), roll=0.1)
     left, right = rolled.horizon([0, 639])

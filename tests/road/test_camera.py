@@ -63,6 +63,19 @@ def test_reads_what_opencv_writes(tmp_path: Path) -> None:
     assert camera.distortion == ()
 
 
+def test_passes_over_what_else_calibration_programs_write(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(OPENCV + 'calibration_time: "Tue"\nflags: 0\navg_reprojection_error: 0.3\nsquare_size: 1.\n')
+    assert read_camera(path).fx == 1100.0
+    ros = OPENCV + "projection_matrix: {rows: 3, cols: 4, data: [1]}\ndistortion_model: "
+    path.write_text(ros + "plumb_bob\n")
+    assert read_camera(path).fx == 1100.0
+    for told in (ros + "equidistant\n", OPENCV + "fisheye_model: 1\n"):
+        path.write_text(told)
+        with pytest.raises(ConfigError, match=r"lenses of the model (equidistant|fisheye) are not known"):
+            read_camera(path)
+
+
 def test_a_field_of_view_is_enough(tmp_path: Path) -> None:
     path = tmp_path / "camera.yaml"
     path.write_text("image_width: 640\nimage_height: 360\nheight: 1.3\nfield_of_view: 70\n")
@@ -145,6 +158,13 @@ def test_the_picture_from_above_shows_lines_where_they_are(drive: tuple[Scene, .
         inside = pixels[(pixels[:, 0] > 2) & (pixels[:, 0] < 237)]
         hit = [above[v, u - 1 : u + 2].max() > 120 for u, v in inside]
         assert np.mean(hit) > 0.9
+
+
+def test_the_view_from_above_is_black_behind_the_camera() -> None:
+    camera = dataclasses.replace(CAMERA, distortion=())
+    above = birds_eye(np.full((720, 1280, 3), 255, np.uint8), camera, View(near=-20.0, far=30.0))
+    assert above[: 20 * 8].any()
+    assert not above[31 * 8 :].any()  # from 1 m behind it
 
 
 def test_the_view_goes_there_and_back() -> None:

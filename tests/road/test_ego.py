@@ -6,9 +6,9 @@ import pytest
 
 from trilitenet.processing.geometry import Camera
 from trilitenet.road.camera import CameraErrors
-from trilitenet.road.ego import BOX_ERROR_SHARE, LaneFilter, LaneFit, find_distances, fit_ego_lane
+from trilitenet.road.ego import BOX_ERROR_SHARE, LaneFilter, LaneFit, LeadFilter, find_distances, fit_ego_lane
 from trilitenet.road.lanes import find_lines
-from trilitenet.road.structures import EgoLane, Estimate, LaneLine
+from trilitenet.road.structures import EgoLane, Estimate, LaneLine, LeadVehicle
 from trilitenet.structures import Boxes
 
 CAMERA = Camera.from_field_of_view((720, 1280), 60.0, 1.4, pitch=0.03)
@@ -139,6 +139,33 @@ def test_the_same_moment_again_changes_nothing() -> None:
     for frame in range(20):
         lane = lanes.update(fit_of(0.5), frame * 0.2)
     assert lanes.update(fit_of(1.0), 19 * 0.2).offset == lane.offset
+
+
+def test_a_late_frame_adds_nothing_to_the_lane() -> None:
+    lanes = LaneFilter()
+    for index in range(20):
+        before = lanes.update(fit_of(0.1 + 0.004 * index, 0.1), index / 25)
+    assert lanes.update(fit_of(0.8), 18.5 / 25) == before
+    after = lanes.update(fit_of(0.18, 0.1), 20 / 25)
+    assert offset_of(after).error < 1.01 * offset_of(before).error
+    assert offset_of(lanes.update(fit_of(0.8), 0.0)).value == pytest.approx(0.8)  # not late: the clock was set back
+
+
+def test_late_frames_leave_the_closing_speed_alone() -> None:
+    camera, told = Camera.from_field_of_view((384, 640), 60.0, 1.4), []
+    leads = LeadFilter()
+    boxes = Boxes(np.array([[300, 180, 340, 220]], np.float32), np.ones(1, np.float32), np.zeros(1, np.int64))
+    for index in range(60):
+        moment = index / 25 - (0.05 if index % 10 == 9 else 0.0)
+        lead = LeadVehicle(0, 7, Estimate(30.0 - 8 * moment, 1.0))
+        found = leads.update(lead, boxes, moment, camera)
+        assert found is not None
+        told.append(None if found.closing_speed is None else found.closing_speed.value)
+    assert all(speed is not None for speed in told[20:])
+    assert told[-1] == pytest.approx(8.0, abs=0.5)
+    other = LeadVehicle(0, 9, Estimate(5.0, 1.0))
+    assert leads.update(other, boxes, 57.5 / 25, camera) is other  # late, and another vehicle: passed on as it is
+    assert leads.update(lead, boxes, 60 / 25, camera).closing_speed is not None  # type: ignore[union-attr]
 
 
 def test_what_one_frame_alone_errs_by_is_not_kept() -> None:

@@ -98,6 +98,20 @@ def test_a_lead_that_no_longer_closes_ends_the_warning() -> None:
     assert event.timestamp == pytest.approx(0.9, abs=0.05)
 
 
+def test_a_clock_set_back_does_not_stop_an_event_that_was_about_to_begin() -> None:
+    detector = EventDetector()
+    assert not run(detector, [road(1.2, 0.02)] * 2, start=102.0)
+    (begin,) = run(detector, [road(1.2, 0.02)] * 10, start=2.0)
+    assert begin.phase == "begin"
+
+
+def test_a_late_frame_without_a_reading_does_not_end_an_event() -> None:
+    detector = EventDetector()
+    run(detector, [road(1.2, 0.02)] * 10)
+    assert not detector.update(Road(), 0.3)
+    assert detector.warnings == ("lane_departure_left",)
+
+
 def test_an_event_as_json() -> None:
     event = Event("forward_collision", "begin", 1.23456, 30, 2.5, 7)
     assert event.to_dict() == {

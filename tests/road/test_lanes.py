@@ -6,6 +6,7 @@ import pytest
 from numpy.typing import NDArray
 
 from trilitenet.data.synthetic import Scene, SyntheticScenes
+from trilitenet.processing.geometry import Camera
 from trilitenet.road.lanes import assign_positions, find_lines, vanishing_point
 
 SIZE = (384, 640)
@@ -131,6 +132,21 @@ def test_the_vanishing_point_of_a_straight_drive(drive: tuple[Scene, ...]) -> No
             assert abs(errors[-1]) < 4 * point.error
     assert len(errors) >= 7
     assert np.median(np.abs(errors)) < 0.5
+
+
+def test_the_vanishing_point_behind_a_lens_that_bends_lines() -> None:
+    camera = Camera((720, 1280), 700.0, 700.0, 639.5, 359.5, 1.4, 0.14, distortion=(-0.3, 0.1, 0.0, 0.0, 0.0))
+    ahead = np.linspace(3.0, 60.0, 80)
+    mask = np.zeros(camera.size, np.uint8)
+    for y in (-1.8, 1.8):
+        pixels = camera.to_pixels(np.stack([ahead, np.full(80, y)], axis=1))
+        cv2.polylines(mask, [np.round(pixels * 16).astype(np.int32)], False, 1, 6, cv2.LINE_8, 4)
+    lines = find_lines(mask.astype(np.bool_))
+    straightened, bent = (vanishing_point(lines, camera.size, known) for known in (camera, None))
+    assert straightened is not None
+    assert bent is not None
+    assert abs(straightened.v - camera.vanishing_point()[1]) < 1.5
+    assert abs(bent.v - camera.vanishing_point()[1]) > 5
 
 
 def test_no_vanishing_point_of_one_line_or_of_none() -> None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Any
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -25,6 +25,11 @@ from trilitenet.errors import ConfigError
 __all__ = ["Camera"]
 
 Floats = NDArray[np.float64]
+
+_EXACT: Final = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+"""When the inverse of a lens is found: OpenCV's usual five steps leave wide lenses pixels off."""
+_MAX_MISS: Final = 0.5
+"""Pixels by which a pixel may miss itself, there and back through the lens; beyond, the lens cannot show it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,16 +140,33 @@ class Camera:
             pixels: (N, 2) u, v.
 
         Returns:
-            (N, 3) in the vehicle's axes, not normalised: the component along the optical axis is 1.
+            (N, 3) in the vehicle's axes, not normalised: the component along the optical axis is 1; NaN where the
+            model of the lens shows nothing.
+        """
+        x, y = ((self.undistorted(pixels) - (self.cx, self.cy)) / (self.fx, self.fy)).T
+        return np.asarray(np.stack([x, y, np.ones_like(x)], axis=1) @ self.rotation.T, np.float64)
+
+    def undistorted(self, pixels: ArrayLike) -> Floats:
+        """Return where an ideal lens would show what pixels show.
+
+        Args:
+            pixels: (N, 2) u, v.
+
+        Returns:
+            (N, 2) u, v; NaN for pixels that the model of the lens shows nothing at, as far from the middle as it may
+            fold back.
         """
         points = np.asarray(pixels, np.float64).reshape(-1, 2)
-        if self.distortion and len(points):
-            ideal = cv2.undistortPoints(points[:, None], self.matrix, np.array(self.distortion))
-            x, y = np.asarray(ideal, np.float64).reshape(-1, 2).T
-        else:
-            x = (points[:, 0] - self.cx) / self.fx
-            y = (points[:, 1] - self.cy) / self.fy
-        return np.asarray(np.stack([x, y, np.ones_like(x)], axis=1) @ self.rotation.T, np.float64)
+        if not self.distortion or not len(points):
+            return points
+        lens = np.array(self.distortion)
+        found = cv2.undistortPoints(points[:, None], self.matrix, lens, None, None, None, _EXACT)
+        ideal = np.asarray(found, np.float64).reshape(-1, 2)
+        local = np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1)
+        back, _ = cv2.projectPoints(local[:, None], np.zeros(3), np.zeros(3), self.matrix, lens)
+        missed = np.linalg.norm(np.asarray(back, np.float64).reshape(-1, 2) - points, axis=1)
+        ideal[~(missed <= _MAX_MISS)] = np.nan
+        return ideal * (self.fx, self.fy) + (self.cx, self.cy)
 
     def to_ground(self, pixels: ArrayLike) -> Floats:
         """Return where pixels meet the flat road.
@@ -153,7 +175,7 @@ class Camera:
             pixels: (N, 2) u, v.
 
         Returns:
-            (N, 2) x forward, y left in metres; NaN on and above the horizon.
+            (N, 2) x forward, y left in metres; NaN on and above the horizon, and where the lens shows nothing.
         """
         rays = self.rays(pixels)
         down = -rays[:, 2]

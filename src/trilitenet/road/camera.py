@@ -63,15 +63,28 @@ class _CameraFile:
     camera_name: str = ""
 
 
+_LENSES: Final = ("plumb_bob", "rational_polynomial")
+"""Distortion models of ROS that are OpenCV's, which `Camera` has."""
+_ROS: Final = {"rectification_matrix", "projection_matrix"}
+_OPENCV: Final = {
+    *("aspectRatio", "avg_reprojection_error", "board_height", "board_width", "calibration_time", "fix_aspect_ratio"),
+    *("extrinsic_parameters", "flags", "grid_points", "image_points", "marker_size", "nframes", "nr_of_frames"),
+    *("per_view_reprojection_errors", "square_size"),
+}
+"""Keys of their calibration programs that do not bear on where a pixel looks."""
+
+
 def read_camera(path: str | Path) -> Camera:
     """Read a camera from YAML.
 
     The intrinsics are as OpenCV and ROS write them (``image_width``, ``image_height``, ``camera_matrix`` and
-    ``distortion_coefficients`` with their ``data``), or ``field_of_view`` in degrees for an ideal lens. To these come
-    the mounting: ``height`` in metres, and ``pitch`` (down), ``yaw`` (left), ``roll`` (right side lowered) in degrees.
+    ``distortion_coefficients`` with their ``data``; what else their calibration programs write is passed over), or
+    ``field_of_view`` in degrees for an ideal lens. To these come the mounting: ``height`` in metres, and ``pitch``
+    (down), ``yaw`` (left), ``roll`` (right side lowered) in degrees.
 
     Raises:
-        ConfigError: If the file is missing or not YAML, has an unknown key, lacks one, or a value is out of range.
+        ConfigError: If the file is missing or not YAML, has an unknown key, lacks one, a value is out of range, or the
+            lens is of another model (a fisheye).
     """
     path = Path(path)
     try:
@@ -86,6 +99,13 @@ def read_camera(path: str | Path) -> Camera:
         raise ConfigError(f"{path}: not YAML ({' '.join(str(error).split())})") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: must be a mapping of keys such as image_width, camera_matrix and height")
+    lens_model = content.pop("distortion_model", _LENSES[0])
+    if lens_model not in _LENSES or content.pop("fisheye_model", 0):
+        name = "fisheye" if lens_model in _LENSES else lens_model
+        raise ConfigError(
+            f"{path}: lenses of the model {name} are not known ({', '.join(_LENSES)} are); undistort the pictures first"
+        )
+    content = {key: value for key, value in content.items() if key not in _ROS | _OPENCV}
     for key in ("camera_matrix", "distortion_coefficients"):
         if isinstance(content.get(key), list):
             content[key] = {"data": _flat(content[key])}
@@ -275,4 +295,7 @@ def birds_eye(image: NDArray[np.uint8], camera: Camera, view: View | None = None
     matrix = camera.ground_homography @ view.matrix
     height, width = view.size
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpPerspective(image, matrix, (width, height), flags=flags), np.uint8)
+    seen = np.array(cv2.warpPerspective(image, matrix, (width, height), flags=flags), np.uint8)
+    depth = matrix[2, 0] * np.arange(width) + matrix[2, 1] * np.arange(height)[:, None] + matrix[2, 2]
+    seen[depth <= 0] = 0  # behind the camera, where the projection would show the sky upside down
+    return seen

@@ -235,6 +235,8 @@ def _kept(value: float, error: float, limit: float) -> Estimate | None:
     return Estimate(value, error) if math.isfinite(value) and error <= limit else None
 
 
+LATE: Final = 0.5
+"""Seconds by which a frame may come after a later one: what is followed goes on, and the frame adds nothing to it."""
 _SEEN: Final = [0, 2, 4]
 """Where offset, heading and curvature stand in the state of a `LaneFilter`."""
 
@@ -280,12 +282,13 @@ class LaneFilter:
             return fit.lane
         step = timestamp - self._last
         off = np.zeros(3)
-        if self._state is None or not 0 <= step <= self.GAP:
+        if self._state is None or not -LATE <= step <= self.GAP:
             self._start(fit)
-        elif step > 0:  # else it is the same moment again
+            self._last = timestamp
+        elif step > 0:  # else it is the same moment again, or a late frame
             self._advance(step)
             off = self._take_in(fit, step)
-        self._last = timestamp
+            self._last = timestamp
         assert self._state is not None
         values = self._state[_SEEN]
         errors = np.sqrt(np.diag(self._covariance)[_SEEN] + fit.lasting**2 + off**2)
@@ -471,19 +474,25 @@ class LeadFilter:
         pixel = self.BOX_NOISE * camera.size[1] / 640
         noise = pixel * (lead.distance.value**2 + camera.height**2) / (camera.fy * camera.height)
         step = timestamp - self._last
-        if self._state is None or not 0 <= step <= self.GAP or not self._is_same(lead, box):
-            self._state = np.array([lead.distance.value, 0.0])
-            self._covariance = np.diag([noise**2, 15.0**2])
-            self._since = timestamp
+        same = self._state is not None and -LATE <= step <= self.GAP and self._is_same(lead, box)
+        if -LATE <= step < 0 and self._state is not None:
+            if not same:
+                return lead
         else:
-            self._advance(step, lead.distance.value, noise)
-        self._last, self._identity, self._box = timestamp, lead.track_id, box
+            if same:
+                self._advance(step, lead.distance.value, noise)
+            else:
+                self._state = np.array([lead.distance.value, 0.0])
+                self._covariance = np.diag([noise**2, 15.0**2])
+                self._since = timestamp
+            self._last, self._identity, self._box = timestamp, lead.track_id, box
+        assert self._state is not None
         distance, rate = self._state.tolist()
         spread = math.sqrt(max(self._covariance[0, 0], 0.0))
         systematic = math.sqrt(max(lead.distance.error**2 - noise**2, 0.0))
         found = Estimate(distance, math.hypot(spread, systematic))
         speed_error = math.hypot(math.sqrt(self._covariance[1, 1]), rate * systematic / max(distance, 1.0))
-        if timestamp - self._since < self.NEEDED or speed_error > self.MAX_SPEED_ERROR:
+        if self._last - self._since < self.NEEDED or speed_error > self.MAX_SPEED_ERROR:
             return dataclasses.replace(lead, distance=found)
         closing = Estimate(-rate, speed_error)
         left = None

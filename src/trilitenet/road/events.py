@@ -72,7 +72,7 @@ class _State:
             self.value = value
         if wants is None:
             self.since = None
-            if not self.on or 0 <= timestamp - self.read <= limits.unknown:
+            if not self.on or abs(timestamp - self.read) <= limits.unknown:
                 return None
             self.on = False
             return "end"
@@ -80,7 +80,7 @@ class _State:
         if wants == self.on:
             self.since = None
             return None
-        if self.since is None:
+        if self.since is None or timestamp < self.since:  # the latter of a late frame, or of a clock that was set back
             self.since = timestamp
         if timestamp - self.since < (limits.hold if self.on else limits.confirm):
             return None

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from trilitenet.processing.geometry import Camera
 from trilitenet.road.structures import LaneLine
 
 __all__ = ["VanishingPoint", "assign_positions", "find_lines", "vanishing_point"]
@@ -295,12 +296,16 @@ def _same(line: LaneLine, other: LaneLine, scale: float) -> bool:
     return bool(share > 0.3 and (apart < near).all())
 
 
-def vanishing_point(lines: Sequence[LaneLine], size: tuple[int, int]) -> VanishingPoint | None:
+def vanishing_point(
+    lines: Sequence[LaneLine], size: tuple[int, int], camera: Camera | None = None
+) -> VanishingPoint | None:
     """Return where the near parts of the lines meet.
 
     Args:
         lines: Lines of one picture.
         size: (height, width) of the picture in pixels.
+        camera: The camera, if its lens is known: lines that it bends are straightened, and the point is an ideal
+            lens's.
 
     Returns:
         None with fewer than two good lines, or when they are too parallel in the picture to tell.
@@ -313,14 +318,14 @@ def vanishing_point(lines: Sequence[LaneLine], size: tuple[int, int]) -> Vanishi
         v0, span = line.origin
         if line.confidence < 0.35 or v0 < 0.6 * height or -span < 0.12 * height:
             continue
-        low, high = v0, v0 + 0.6 * span
-        u_low, u_high = float(line.column(low)), float(line.column(high))
-        middle = float(line.column((low + high) / 2))
-        slope = (u_high - u_low) / (high - low)
-        if abs(middle - (u_low + u_high) / 2) > 0.012 * width * math.sqrt(1 + slope * slope):
-            continue  # the near part is bent
+        rows = v0 + span * np.array([0.0, 0.3, 0.6])
+        near = np.stack([line.column(rows), rows], axis=1)
+        (u, v), (u_middle, v_middle), (u_far, v_far) = near if camera is None else camera.undistorted(near)
+        slope = float((u_far - u) / (v_far - v))
+        if not abs(u_middle - u - slope * (v_middle - v)) <= 0.012 * width * math.sqrt(1 + slope * slope):
+            continue  # the near part is bent, or not of the lens
         slopes.append(slope)
-        bases.append(u_low - slope * low)
+        bases.append(float(u - slope * v))
         weights.append(line.confidence / (1 + slope * slope))
     if len(slopes) < 2:
         return None

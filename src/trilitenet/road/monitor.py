@@ -123,7 +123,7 @@ class RoadMonitor:
                 return None, CameraErrors(), None
             camera, errors = calibration.camera, calibration.errors
         # Where this frame's lanes surely vanish elsewhere, the car pitches: what rests on the horizon is less sure.
-        seen = vanishing_point(lines, camera.size)
+        seen = vanishing_point(lines, camera.size, camera)
         if seen is not None and seen.lines >= 2:
             away = abs(seen.v - camera.vanishing_point()[1])
             if away > 3 * seen.error:
