@@ -14,6 +14,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from trilitenet.errors import needing_torch
+
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
@@ -55,7 +57,8 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name in _PUBLIC:
-        value = getattr(importlib.import_module(_PUBLIC[name]), name)
+        with needing_torch():
+            value = getattr(importlib.import_module(_PUBLIC[name]), name)
         globals()[name] = value
         return value
     raise AttributeError(f"module 'trilitenet' has no attribute {name!r}")

@@ -129,6 +129,24 @@ def import_extra(module: str, extra: str) -> ModuleType:
 
 
 @contextlib.contextmanager
+def needing_torch() -> Iterator[None]:
+    """Say what to do where PyTorch is not installed.
+
+    Raises:
+        MissingExtraError: If a module of PyTorch is not found.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "torch":
+            raise
+        raise MissingExtraError(
+            "this needs PyTorch, which is not installed: pip install 'torch>=2.4,<2.14'; "
+            "without it, exported files run on ONNX Runtime, OpenVINO and NCNN"
+        ) from error
+
+
+@contextlib.contextmanager
 def writing(output: str | Path) -> Iterator[None]:
     """Tell what the system says on writing, such as that the disk is full, in one line.
 
@@ -175,10 +193,10 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     part = path.with_name(f".{path.name[:_BEGINNING]}.{secrets.token_hex(4)}.part")
     os.close(os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    mode = stat.S_IMODE((path if path.is_file() else part).stat().st_mode)
     try:
         yield part
-        if path.is_file():
-            part.chmod(stat.S_IMODE(path.stat().st_mode))
+        part.chmod(mode)  # safetensors makes its files readable to their owner alone
         part.replace(path)
     except BaseException:
         part.unlink(missing_ok=True)

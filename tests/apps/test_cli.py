@@ -164,6 +164,24 @@ def test_without_pytorch_is_one_line(words: str, tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
+def test_without_pytorch_python_says_so_too() -> None:
+    code = (
+        "import sys\n"
+        "sys.modules['torch'] = None\n"
+        "import trilitenet\n"
+        "from trilitenet.errors import MissingExtraError\n"
+        "for use in (lambda: trilitenet.load('tiny'), lambda: trilitenet.build_network):\n"
+        "    try:\n"
+        "        use()\n"
+        "    except MissingExtraError as error:\n"
+        "        assert str(error).startswith('this needs PyTorch'), error\n"
+        "    else:\n"
+        "        raise AssertionError\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+
+
 def test_several_values_may_follow_one_option() -> None:
     words = [
         "benchmark",

@@ -231,7 +231,7 @@ def test_doubled_masks_of_shipped_weights(tmp_path: Path, format_: Any, name: st
 def test_nothing_is_written_beyond_the_tolerance(
     artefacts: Artefacts, tmp_path: Path, frames: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(TOLERANCES, "fp32", Tolerance(pixels=1.1, boxes=1.1))
+    monkeypatch.setitem(TOLERANCES, "fp32", Tolerance(pixels=1.1, boxes=1.1, confidence=1.0))
     weights = str(artefacts.folder / "weights.safetensors")
     with pytest.raises(BackendError, match="not written, it differs from the network"):
         export(weights, size="64x128", output=tmp_path / "a.onnx", frames=frames)
@@ -295,7 +295,7 @@ def test_int8(
 ) -> None:
     if format_ == "openvino":
         pytest.importorskip("nncf")
-    monkeypatch.setitem(TOLERANCES, "int8", Tolerance(pixels=0.5, boxes=0.0))
+    monkeypatch.setitem(TOLERANCES, "int8", Tolerance(pixels=0.5, boxes=0.0, confidence=1.0))
     path = tmp_path / ("a.xml" if format_ == "openvino" else "a.onnx")
     done = export(
         str(artefacts.folder / "weights.safetensors"),

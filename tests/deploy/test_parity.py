@@ -1,11 +1,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from trilitenet.deploy.parity import Tolerance, compare
 from trilitenet.structures import RawOutputs
 
-STRICT = Tolerance(pixels=0.999, boxes=0.99)
+STRICT = Tolerance(pixels=0.999, boxes=0.99, confidence=0.02)
 CANVAS = np.zeros((32, 64, 3), np.uint8)
 
 
@@ -33,6 +34,34 @@ def test_a_moved_box_fails_from_either_side() -> None:
     assert ghost.detection is not None
     ghost.detection[0, 1, 4:] = 0.9
     assert "boxes agree" in parity_of(ghost)[0]
+
+
+def test_another_confidence_fails_though_the_box_is_the_same() -> None:
+    surer = outputs()
+    assert surer.detection is not None
+    surer.detection[0, 0, 4] = 0.95
+    assert "boxes agree" in parity_of(surer)[0]
+
+
+@pytest.mark.parametrize("confidence", [0.9, 0.999])
+def test_boxes_below_the_threshold_are_compared_if_none_is_above(confidence: float) -> None:
+    def failures(changed: RawOutputs) -> list[str]:
+        return compare(lambda _: outputs(), lambda _: changed, [CANVAS], STRICT, confidence=confidence).failures
+
+    assert failures(outputs()) == []
+    moved = outputs()
+    assert moved.detection is not None
+    moved.detection[0, 0, 0] += 8
+    assert "boxes agree" in failures(moved)[0]
+
+
+def test_nothing_to_compare_fails_or_is_told() -> None:
+    nothing = np.zeros((1, 2, 6), np.float32)
+    boxes, both = RawOutputs(nothing, None, None), RawOutputs(nothing, None, outputs().lane)
+    assert "no box to compare" in compare(lambda _: boxes, lambda _: boxes, [CANVAS], STRICT).failures[0]
+    parity = compare(lambda _: both, lambda _: both, [CANVAS], STRICT)
+    assert parity.failures == []
+    assert "no box to compare" in parity.summary()
 
 
 def test_other_pixels_fail() -> None:

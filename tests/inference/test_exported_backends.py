@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import pickle
 import shutil
 import subprocess
@@ -153,6 +154,16 @@ os.kill(os.getpid(), signal.SIGUSR1)
 assert caught
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+
+
+@pytest.mark.parametrize(("name", "kind"), [("model.xml", OpenVINOBackend), ("model.ncnn.param", NcnnBackend)])
+def test_a_fork_is_told_to_load_the_model_itself(
+    artefacts: Artefacts, name: str, kind: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend = kind(artefacts.folder / name)
+    monkeypatch.setattr(os, "getpid", lambda: -1)
+    with pytest.raises(BackendError, match="before this process was forked; load it in this process"):
+        backend.run(np.zeros((1, *backend.canvas, 3), np.uint8))
 
 
 def test_an_interruption_leaves_every_request_idle(artefacts: Artefacts) -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import copy
 import json
 import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,18 @@ def test_boxes_take_lists_and_refuse_what_is_no_array() -> None:
             Boxes(broken, [0.5], [0])  # type: ignore[arg-type]
 
 
+def test_numbers_of_numpy_and_paths_become_json() -> None:
+    boxes = Boxes(np.ones((1, 4), np.float32), np.ones(1, np.float32), np.zeros(1, np.int64))
+    size: Any = tuple(np.array([4, 6]))
+    given: dict[str, Any] = {"source": Path("a.jpg"), "frame": np.int64(3), "timestamp": np.float32(0.5)}
+    told = json.loads(json.dumps(Perception(size=size, boxes=boxes, **given).to_dict(), allow_nan=False))
+    assert (told["source"], told["frame"], told["timestamp"], told["size"]["width"]) == ("a.jpg", 3, 0.5, 6)
+    wild = Boxes(np.full((1, 4), np.nan, np.float32), np.ones(1, np.float32), np.zeros(1, np.int64))
+    for broken in (Perception(size=(4, 6), boxes=wild), Perception(size=(4, 6), timestamp=float("nan"))):
+        with pytest.raises(ShapeError, match="finite"):
+            broken.to_dict()
+
+
 def test_an_absent_task_is_null_and_an_empty_one_is_empty() -> None:
     absent = Perception(size=(4, 4)).to_dict()
     assert absent["boxes"] is absent["drivable"] is absent["lane"] is None
@@ -103,6 +116,18 @@ def test_an_absent_task_is_null_and_an_empty_one_is_empty() -> None:
         {"boxes": [{"xyxy": [1, 2, 3, 4], "confidence": 0.5, "class_id": -1}]},
         {"boxes": [{"xyxy": [1, 2, 3, 4], "confidence": 0.5, "class_id": 10**30}]},
         {"lane": {"size": [40, 60], "counts": [2400]}},
+        {"schema": "0.9"},
+        {"schema": "1.x"},
+        {"size": {"height": 40.9, "width": 60}},
+        {"boxes": {}},
+        {"boxes": [{"xyxy": [1, 2, 3, 4], "confidence": 0.5, "class_id": 0.7}]},
+        {"boxes": [{"xyxy": [1, 2, None, 4], "confidence": 0.5, "class_id": 0}]},
+        {"boxes": [{"xyxy": [1, 2, 3, 4], "confidence": "0.5", "class_id": 0}]},
+        {"boxes": [{"xyxy": [1, 2, 3, 4], "confidence": float("nan"), "class_id": 0}]},
+        {"frame": "abc"},
+        {"source": 3},
+        {"timestamp": True},
+        {"timestamp": float("inf")},
     ],
 )
 def test_what_is_not_that_form_is_refused(change: dict[str, Any]) -> None:

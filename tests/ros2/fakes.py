@@ -98,7 +98,7 @@ def modules() -> dict[str, types.ModuleType]:
         KEEP_LAST = BEST_EFFORT = 1
 
     return {
-        "rclpy": module("rclpy"),
+        "rclpy": module("rclpy", init=lambda: None, try_shutdown=lambda: None),
         "rclpy.node": module("rclpy.node", Node=Node),
         "rclpy.qos": module("rclpy.qos", HistoryPolicy=Policy, ReliabilityPolicy=Policy, QoSProfile=dict),
         "geometry_msgs": module("geometry_msgs"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import array
 import importlib
 import math
+import re
 import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -173,6 +174,20 @@ def test_a_camera_file_of_another_shape_is_told_and_the_rest_published(
         node.subscriptions["image"](_image("bgr8", np.zeros((96, 160, 3), np.uint8)))
         assert len(node.publishers["~/detections"].published) == count
     assert "the camera file is for 100x100 pixels" in "".join(node.messages)
+
+
+@pytest.mark.parametrize("parameters", [{"model": "nomodel"}, {"camera_file": "missing.yaml"}, {"confidence": 2.0}])
+def test_a_wrong_parameter_is_one_line(
+    messages: Any, monkeypatch: pytest.MonkeyPatch, parameters: dict[str, Any]
+) -> None:
+    for name, module in fakes.modules().items():
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.delitem(sys.modules, "trilitenet_ros.node", raising=False)
+    node_module = importlib.import_module("trilitenet_ros.node")
+    monkeypatch.setattr(fakes.Node, "overrides", parameters)
+    with pytest.raises(SystemExit) as ended:
+        node_module.main()
+    assert re.fullmatch(r"error: .*(nomodel|missing\.yaml|confidence).*", str(ended.value.code))
 
 
 def test_the_package_is_described_once_and_alike() -> None:

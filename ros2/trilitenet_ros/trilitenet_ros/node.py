@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import sys
 
 import rclpy
 from geometry_msgs.msg import PoseStamped
@@ -19,6 +20,7 @@ from sensor_msgs.msg import Image
 from vision_msgs.msg import Detection2D, Detection2DArray, ObjectHypothesisWithPose
 
 import trilitenet
+from trilitenet.errors import TriLiteNetError
 from trilitenet.road.camera import read_camera
 from trilitenet.road.monitor import RoadMonitor
 from trilitenet_ros.messages import Types, fill_detections, fill_mask, fill_path, read_image
@@ -56,7 +58,7 @@ class PerceptionNode(Node):
     def _on_image(self, message: Image) -> None:
         try:
             self._see(message)
-        except ValueError as error:  # a picture that cannot be seen, or that the camera file does not describe
+        except (TriLiteNetError, ValueError) as error:  # such as a picture that the camera file does not describe
             self.get_logger().error(str(error), throttle_duration_sec=5.0)
 
     def _see(self, message: Image) -> None:
@@ -81,7 +83,11 @@ class PerceptionNode(Node):
 def main() -> None:
     """Run the node until it is stopped."""
     rclpy.init()
-    node = PerceptionNode()
+    try:
+        node = PerceptionNode()
+    except TriLiteNetError as error:  # a parameter
+        rclpy.try_shutdown()
+        sys.exit(f"error: {error}")
     try:
         rclpy.spin(node)
     except KeyboardInterrupt:

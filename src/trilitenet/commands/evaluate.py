@@ -18,7 +18,7 @@ from trilitenet.engine.evaluate import EvaluatedPredictor
 from trilitenet.engine.evaluate import evaluate as run_evaluation
 from trilitenet.engine.predictions import PredictionWriter
 from trilitenet.engine.provenance import hash_files
-from trilitenet.engine.report import Report, Variation
+from trilitenet.engine.report import Report, Variation, read_report
 from trilitenet.engine.robustness import corrupted_figures, figures_by_size
 from trilitenet.engine.scorecard import CONDITIONS
 from trilitenet.errors import ConfigError, OutputError
@@ -223,6 +223,16 @@ def hash_dataset(dataset: DrivingDataset, limit: int | None = None) -> dict[str,
         "lane": labels("lane"),
         "boxes": labels("detection"),
     }
+
+
+def known_report(folder: Path, model: str, data_hash: dict[str, str]) -> Report | None:
+    """Return the report that is in a folder, if it is of this model's file and of these images and labels."""
+    path = folder / "report.json"
+    if not path.is_file():
+        return None
+    report = read_report(path)
+    same = report.provenance.model_sha256 == hash_model(model) and report.provenance.data_sha256 == data_hash
+    return report if same else None
 
 
 def check_counts(resamples: int, worst: int = 0, limit: int | None = None) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Literal
 
-from trilitenet.commands.evaluate import evaluate, hash_dataset, hash_model
+from trilitenet.commands.evaluate import evaluate, hash_dataset, hash_model, known_report
 from trilitenet.commands.export import (
     PRECISIONS,
     Precision,
@@ -18,23 +18,15 @@ from trilitenet.commands.export import (
     find_pictures,
 )
 from trilitenet.commands.paths import check_writable, text_paths
-from trilitenet.commands.tables import markdown_row
+from trilitenet.commands.tables import PAPER_COLUMNS, markdown_row
 from trilitenet.config import ARTEFACT_SUFFIXES
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.provenance import hash_files
-from trilitenet.engine.report import Report, read_report
 from trilitenet.errors import ConfigError, write_file
 from trilitenet.models.weights import read_card
 
 __all__ = ["PrecisionRow", "PrecisionTable", "evaluate_table"]
 
-_PAPER: Final = {
-    "paper/detection/recall": "Recall (%)",
-    "paper/detection/map50": "mAP@0.5 (%)",
-    "paper/drivable/miou": "Drivable mIoU (%)",
-    "paper/lane/acc": "Lane Acc (%)",
-    "paper/lane/iou": "Lane IoU (%)",
-}
 _FAIR: Final = {
     "fair/detection/ap50": "AP50 (%)",
     "fair/detection/f1": "Vehicle F1 (%)",
@@ -78,7 +70,9 @@ class PrecisionTable:
     def drop(self, row: PrecisionRow) -> tuple[float, str]:
         """Return by how many points a row is at most below the first row of its model, and in which figure."""
         first = self._first(row)
-        lost = {key: 100 * (first.figures[key] - row.figures[key]) for key in (*_PAPER, *_FAIR) if key in row.figures}
+        lost = {
+            key: 100 * (first.figures[key] - row.figures[key]) for key in (*PAPER_COLUMNS, *_FAIR) if key in row.figures
+        }
         lost = {key: value for key, value in lost.items() if not math.isnan(value)}  # as for a task without labels
         worst = max(lost, key=lambda key: lost[key], default="")
         return lost.get(worst, 0.0), worst
@@ -86,7 +80,7 @@ class PrecisionTable:
     def summary(self) -> str:
         """Return two tables in Markdown: the paper's columns by its protocol, and those of the fair one."""
         parts = ["Protocol paper, the columns of the paper's table of precision levels:", ""]
-        parts += [*self._table(_PAPER), "", "Protocol fair:", "", *self._table(_FAIR), ""]
+        parts += [*self._table(PAPER_COLUMNS), "", "Protocol fair:", "", *self._table(_FAIR), ""]
         for row in self.rows:
             lost, name = self.drop(row)
             if lost > 0:
@@ -179,7 +173,8 @@ def evaluate_table(
         for precision in precisions:
             name = f"{Path(model).stem}-{stamp}-{size}-{precision}{int8 if precision == 'int8' else ''}"
             artefact = output / f"{name}{ARTEFACT_SUFFIXES[format]}"
-            report = None if overwrite else _done(output / name / "report.json", artefact, hashes[classes])
+            known = not overwrite and artefact.is_file()
+            report = known_report(output / name, str(artefact), hashes[classes]) if known else None
             if report is None:
                 if overwrite or not artefact.exists():
                     export(
@@ -221,12 +216,3 @@ def _hash_calibration(calibration: Path, frames: int, max_drop: float | None) ->
         return frames_hash
     measured = hash_dataset(drop_frames(calibration))
     return hashlib.sha256("\n".join((frames_hash, *measured.values())).encode()).hexdigest()
-
-
-def _done(path: Path, artefact: Path, data_hash: dict[str, str]) -> Report | None:
-    """Return the report that is there, if it is of this artefact and of these images and labels."""
-    if not path.is_file() or not artefact.is_file():
-        return None
-    report = read_report(path)
-    same = report.provenance.model_sha256 == hash_model(str(artefact)) and report.provenance.data_sha256 == data_hash
-    return report if same else None

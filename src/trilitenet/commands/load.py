@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from trilitenet.config import VARIANTS, ModelCard, Thresholds
-from trilitenet.errors import ConfigError, did_you_mean
+from trilitenet.errors import ConfigError, did_you_mean, needing_torch
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.exported import is_int8_onnx
 from trilitenet.inference.predictor import Predictor
@@ -67,13 +67,15 @@ def load(
     Raises:
         WeightsError: If the file is missing, broken or foreign.
         BackendError: If the device or the runtime is not there.
+        MissingExtraError: If the runtime is not installed.
         ConfigError: If an option is unknown or out of range.
     """
     if backend not in BACKENDS:
         raise ConfigError(f"unknown backend {backend!r}{did_you_mean(backend, BACKENDS)}")
     if streams < 1 or (threads is not None and threads < 1):
         raise ConfigError(f"streams and threads must be at least 1, got {streams} and {threads}")
-    runtime = _open(model, device, backend, streams, threads)
+    with needing_torch():
+        runtime = _open(model, device, backend, streams, threads)
     try:
         thresholds = _override(runtime.card, confidence=confidence, iou=iou, drivable=drivable, lane=lane)
         return Predictor(runtime, thresholds, long_side=long_side, batch_size=batch_size)

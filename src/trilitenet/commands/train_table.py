@@ -1,4 +1,4 @@
-"""Train every row of a table of the paper, and print the table as the paper does."""
+"""Train every row of a table of the paper, measure it as published, and print the table as the paper does."""
 
 from __future__ import annotations
 
@@ -9,28 +9,30 @@ from typing import Any, Final
 
 import yaml
 
+from trilitenet.commands.evaluate import evaluate, hash_dataset, known_report
 from trilitenet.commands.paths import text_paths
-from trilitenet.commands.tables import markdown_row
+from trilitenet.commands.tables import PAPER_COLUMNS, markdown_row
 from trilitenet.commands.train import train, training_data
 from trilitenet.config import read_yaml
 from trilitenet.data.identity import identify, tell_apart
+from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.checkpoint import read_checkpoint
 from trilitenet.engine.recipe import TrainConfig, read_recipe
 from trilitenet.engine.train import CHECKPOINT_NAME
 from trilitenet.errors import ConfigError, OutputError, brief
 from trilitenet.models.cost import count_multiply_adds, count_parameters
+from trilitenet.models.trilitenet import TriLiteNet
 from trilitenet.models.weights import load_network
 
 __all__ = ["TableResult", "TableRow", "train_table"]
 
-_FIGURES: Final = ("detection/recall", "detection/ap50", "drivable/miou", "lane/accuracy", "lane/iou")
+_REPORT: Final = "evaluation"
 _WEIGHTS: Final = "final.safetensors"
 _FREE: Final = frozenset(
     {"data", "output", "device", "devices", "num_nodes", "workers", "compile"}
     | {"loggers", "log_every", "pictures", "checkpoint_every"}
 )
 """Settings in which a row that is done may differ from what is asked for: the data's content is compared by itself."""
-_HEADINGS: Final = ("Recall (%)", "mAP@0.5 (%)", "Drivable mIoU (%)", "Lane Acc (%)", "Lane IoU (%)")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +41,7 @@ class TableRow:
 
     Attributes:
         name: Of the row.
-        figures: Figures of the last validation, by name, in [0, 1]; a task it lacks is left out.
+        figures: ``paper/task/name`` -> value in [0, 1] on the validation split; a task it lacks is left out.
         parameters: Number of parameters.
         multiply_adds: For one input.
     """
@@ -75,15 +77,17 @@ class TableResult:
         """Return the table in Markdown; nothing for a process that is not the first."""
         if not self.first:
             return ""
-        head = ("Method", *_HEADINGS, "Params (M)", "Multiply-adds (G)")
+        head = ("Method", *PAPER_COLUMNS.values(), "Params (M)", "Multiply-adds (G)")
         lines = [
             self.title if self.finished else f"{self.title} (stopped; go on with --resume)",
+            "",
+            "Validation split, protocol `paper`:",
             "",
             markdown_row(head),
             markdown_row(["---"] * len(head)),
         ]
         for row in self.rows:
-            cells = [f"{100 * row.figures[name]:.1f}" if name in row.figures else "-" for name in _FIGURES]
+            cells = [f"{100 * row.figures[name]:.1f}" if name in row.figures else "-" for name in PAPER_COLUMNS]
             cost = (f"{row.parameters / 1e6:.2f}", f"{row.multiply_adds / 1e9:.2f}")
             lines.append(markdown_row([row.name, *cells, *cost]))
         return "\n".join(lines)
@@ -91,7 +95,9 @@ class TableResult:
 
 @text_paths
 def train_table(table: Path, /, *, data: Path, output: Path, resume: bool = False, settings: str = "") -> TableResult:
-    """Train every row of a table of the paper and print the table; rows that are done are not trained again.
+    """Train every row of a table of the paper, measure it under the published protocol, and print the table.
+
+    Rows that are done are not trained again. A row's report is in its folder, under evaluation.
 
     Args:
         table: A YAML file with a title and rows: name -> recipe, relative to the file.
@@ -134,11 +140,32 @@ def train_table(table: Path, /, *, data: Path, output: Path, resume: bool = Fals
         if not finished:
             break
         network = load_network(weights)
-        figures = {key.removeprefix("val "): value for key, value in network.card.metrics.items()}
+        figures = _measure(weights, network, read_recipe(recipe, fields)) if first else {}
         rows.append(
             TableRow(name, figures, count_parameters(network), count_multiply_adds(network, network.card.input_size))
         )
     return TableResult(title, tuple(rows), len(rows) == len(recipes), first)
+
+
+def _measure(weights: Path, network: TriLiteNet, config: TrainConfig) -> dict[str, float]:
+    """Return a row's figures as published, by the report in its folder, which is made if it is not there."""
+    if not config.val_split:
+        return {}
+    dataset = DrivingDataset(config.data, config.val_split, class_names=network.card.class_names)
+    folder = weights.parent / _REPORT
+    report = known_report(folder, str(weights), hash_dataset(dataset)) or evaluate(
+        str(weights),
+        data=Path(config.data),
+        split=config.val_split,
+        protocol="paper",
+        output=folder,
+        overwrite=True,
+        resamples=0,
+        worst=0,
+        device=config.device,
+        backend="torch",
+    )
+    return {name: report.figures[name].value for name in PAPER_COLUMNS if name in report.figures}
 
 
 def _check_done(folder: Path, config: TrainConfig) -> None:

@@ -24,17 +24,19 @@ class Tolerance:
         pixels: Least share of mask pixels that agree.
         boxes: Least share of the network's confident boxes that the artefact has too (IoU of at least 0.9, or
             sides less than half a pixel apart), and the reverse.
+        confidence: Most that the confidence of such a pair may differ.
     """
 
     pixels: float
     boxes: float
+    confidence: float
 
 
 TOLERANCES: Final[dict[str, Tolerance]] = {
-    "fp32": Tolerance(pixels=0.9999, boxes=0.995),
-    "fp16": Tolerance(pixels=0.998, boxes=0.95),
-    "bf16": Tolerance(pixels=0.99, boxes=0.85),
-    "int8": Tolerance(pixels=0.90, boxes=0.50),
+    "fp32": Tolerance(pixels=0.9999, boxes=0.995, confidence=0.02),
+    "fp16": Tolerance(pixels=0.998, boxes=0.95, confidence=0.1),
+    "bf16": Tolerance(pixels=0.99, boxes=0.85, confidence=0.3),
+    "int8": Tolerance(pixels=0.90, boxes=0.50, confidence=0.5),
 }
 """A precision. INT8 is judged by its scores (``--max-drop``); here it is only kept from being nonsense."""
 
@@ -46,9 +48,10 @@ class Parity:
     Attributes:
         frames: Frames compared.
         pixels: Share of mask pixels that agree, the worse of the two tasks; None without masks.
-        boxes: Share of confident boxes found in both; None without detection, or without any such box.
+        boxes: Share of confident boxes found in both; None without detection, or without any box.
         box_error: Mean distance of the sides of such pairs in pixels; None likewise.
         tolerance: What was asked for.
+        detection: Whether there is detection.
     """
 
     frames: int
@@ -56,6 +59,7 @@ class Parity:
     boxes: float | None
     box_error: float | None
     tolerance: Tolerance
+    detection: bool
 
     @property
     def failures(self) -> list[str]:
@@ -65,6 +69,8 @@ class Parity:
             found.append(f"{self.pixels:.5f} of mask pixels agree, at least {self.tolerance.pixels} must")
         if self.boxes is not None and self.boxes < self.tolerance.boxes:
             found.append(f"{self.boxes:.4f} of boxes agree, at least {self.tolerance.boxes} must")
+        if self.pixels is None and self.boxes is None:
+            found.append("there was no box to compare; give --frames with vehicles")
         return found
 
     def summary(self) -> str:
@@ -74,6 +80,8 @@ class Parity:
             parts.append(f"mask pixels equal {self.pixels:.6f}")
         if self.boxes is not None:
             parts.append(f"boxes in both {self.boxes:.4f} (sides {self.box_error:.2f} px apart)")
+        elif self.detection:
+            parts.append("no box to compare (give --frames with vehicles)")
         return "parity: " + ", ".join(parts)
 
 
@@ -98,11 +106,11 @@ def compare(
         canvases: (H, W, 3) uint8 RGB each.
         tolerance: What the artefact may differ by.
         masks: Thresholds of drivable and lane.
-        confidence: Boxes above this are compared.
+        confidence: Boxes above this are compared; if neither side has any, those of more than half of the highest
+            confidence that there is.
     """
     equal: dict[str, list[float]] = {"drivable": [], "lane": []}
-    matched = total = 0
-    errors: list[float] = []
+    rows: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
     for canvas in canvases:
         expected, got = reference(canvas[None]), artefact(canvas[None])
         for name, threshold in zip(("drivable", "lane"), masks, strict=True):
@@ -111,10 +119,11 @@ def compare(
                 limit = int(threshold * 255)
                 equal[name].append(float(np.mean((wanted[0] > limit) == (mask[0] > limit))))
         if expected.detection is not None and got.detection is not None:
-            pairs = [_match(one, other, confidence) for one, other in _both(expected.detection[0], got.detection[0])]
-            matched += sum(count for count, _, _ in pairs)
-            total += sum(count for _, count, _ in pairs)
-            errors += [error for _, _, found in pairs for error in found]
+            rows += [(expected.detection[0], got.detection[0]), (got.detection[0], expected.detection[0])]
+    levels = _levels([one for one, _ in rows], confidence)
+    pairs = [_match(one, other, levels, tolerance.confidence) for one, other in rows]
+    matched, total = sum(count for count, _, _ in pairs), sum(count for _, count, _ in pairs)
+    errors = [error for _, _, found in pairs for error in found]
     shares = [float(np.mean(values)) for values in equal.values() if values]
     return Parity(
         frames=len(canvases),
@@ -122,33 +131,41 @@ def compare(
         boxes=matched / total if total else None,
         box_error=float(np.mean(errors)) if errors else (0.0 if total else None),
         tolerance=tolerance,
+        detection=bool(rows),
     )
 
 
-def _both(
-    one: NDArray[np.float32], other: NDArray[np.float32]
-) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    return [(one, other), (other, one)]
+def _levels(frames: Sequence[NDArray[np.float32]], confidence: float) -> tuple[float, float]:
+    """Return above which confidence a row must be found, and above which one it is.
+
+    A row must be clearly above the threshold on one side, and need only be near it on the other: rows at the very
+    threshold are decided by rounding.
+    """
+    best = max((float(np.nan_to_num(judge(rows)[1]).max(initial=0)) for rows in frames), default=0.0)
+    if best > confidence + 0.05:
+        return confidence + 0.05, confidence - 0.05
+    return 0.55 * best, 0.45 * best
 
 
 def _match(
-    wanted: NDArray[np.float32], offered: NDArray[np.float32], confidence: float
+    wanted: NDArray[np.float32], offered: NDArray[np.float32], levels: tuple[float, float], apart: float
 ) -> tuple[int, int, list[float]]:
     """Return how many of the confident rows of ``wanted`` have a like row in ``offered``, of how many, and how far off.
 
-    Like is a row of the same most probable class with much the same box. A row must be clearly above the threshold on
-    one side, and need only be near it on the other: rows at the very threshold are decided by rounding.
+    Like is a row of the same most probable class and of a confidence no more than ``apart`` off, with much the same
+    box.
     """
     class_id, scores = judge(wanted)
     best = np.argsort(-scores, kind="stable")[:LIMIT]
-    best = best[scores[best] > confidence + 0.05]
+    best = best[scores[best] > levels[0]]
     other_class, other_scores = judge(offered)
-    around = other_scores > confidence - 0.05
+    around = other_scores > levels[1]
     sure, near = wanted[best], offered[around]
     if not len(sure) or not len(near):
         return 0, len(sure), []
     a, b = cxcywh_to_xyxy(sure[:, :4]), cxcywh_to_xyxy(near[:, :4])
     same = class_id[best][:, None] == other_class[around][None]
+    same &= np.abs(scores[best][:, None] - other_scores[around][None]) <= apart
     iou = np.where(same, box_iou(a, b), 0)
     nearest = iou.argmax(1)
     sides = np.where(same, np.abs(a[:, None] - b[None]).max(2), np.inf)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any, Final, Protocol, runtime_checkable
@@ -11,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import ModelCard
-from trilitenet.errors import ShapeError
+from trilitenet.errors import BackendError, ShapeError
 from trilitenet.processing.cores import usable_cores
 from trilitenet.structures import RawOutputs
 
-__all__ = ["MOST_PARALLEL", "Backend", "ParallelSessions", "check_batch", "replaced"]
+__all__ = ["MOST_PARALLEL", "Backend", "ParallelSessions", "check_batch", "check_process", "replaced"]
 
 MOST_PARALLEL: Final = 4
 """At most so many images are computed at once where a backend trades latency for images a second."""
@@ -36,6 +37,22 @@ def check_batch(batch: NDArray[np.uint8], stride: int = 1) -> None:
     height, width = batch.shape[1:3]
     if height % stride or width % stride:
         raise ShapeError(f"the sides of images must be multiples of {stride} pixels, got {width}x{height}")
+
+
+def check_process(opened_in: int) -> None:
+    """Check that a runtime runs in the process that opened it: a fork lacks its threads, and would wait for ever.
+
+    Args:
+        opened_in: Number of the process that opened it.
+
+    Raises:
+        BackendError: If this is another process.
+    """
+    if os.getpid() != opened_in:
+        raise BackendError(
+            "the model was opened before this process was forked; load it in this process, or start processes with "
+            "multiprocessing.get_context('spawn')"
+        )
 
 
 _REPLACING: Final = threading.Lock()

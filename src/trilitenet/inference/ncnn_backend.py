@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import WEIGHTS_HASH_KEY, ArtefactInfo, ModelCard
 from trilitenet.errors import BackendError, ConfigError, WeightsError, import_extra
-from trilitenet.inference.backend import ParallelSessions
+from trilitenet.inference.backend import ParallelSessions, check_process
 from trilitenet.inference.exported import prepare_input, read_metadata, run_images
 from trilitenet.structures import RawOutputs
 
@@ -63,6 +63,7 @@ class NcnnBackend(ParallelSessions):
         wanted = precision or self.info.precision
         self.precision = "fp16" if wanted == "fp16" and self._ncnn.cpu_support_arm_asimdhp() else "fp32"
         self._device = "cpu"
+        self._process = os.getpid()
         self._session: Any = self._open(threads)
 
     def _open(self, threads: int | None) -> Any:
@@ -104,6 +105,7 @@ class NcnnBackend(ParallelSessions):
         net = self._session
         if net is None:
             raise BackendError(f"{self._path}: the model was closed")
+        check_process(self._process)
         return run_images(batch, self._card, lambda: [self._run(net, image) for image in batch], self.info)
 
     def _run(self, net: Any, image: NDArray[np.uint8]) -> Mapping[str, NDArray[Any]]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ModelCard
 from trilitenet.errors import BackendError, ConfigError, WeightsError, import_extra
-from trilitenet.inference.backend import MOST_PARALLEL, replaced
+from trilitenet.inference.backend import MOST_PARALLEL, check_process, replaced
 from trilitenet.inference.exported import prepare_input, read_metadata, run_images
 from trilitenet.processing.cores import usable_cores
 from trilitenet.structures import RawOutputs
@@ -96,6 +96,7 @@ class OpenVINOBackend:
         self.precision = wanted if wanted in capable else "fp32"
         self._core, self._model, self._path, self._threads = core, model, path, threads
         self.streams = streams
+        self._process = os.getpid()
         compiled = self._compile(streams)
         self._outputs = [output.get_any_name() for output in compiled.outputs]
         self._idle: queue.SimpleQueue[Any] | None = _requests(compiled, streams)
@@ -149,6 +150,7 @@ class OpenVINOBackend:
         idle = self._idle
         if idle is None:
             raise BackendError(f"{self._path}: the model was closed")
+        check_process(self._process)
 
         def outputs() -> list[Mapping[str, NDArray[Any]]]:
             results: list[Mapping[str, NDArray[Any]]] = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from typing import Any
 
 import cv2
@@ -65,14 +67,22 @@ def perception_to_dict(perception: Perception) -> dict[str, Any]:
     """Return what ``json.dumps`` takes. Coordinates are pixels of the source image, rounded to 1/100.
 
     A task the model lacks is null; a task that found nothing is an empty list or an empty mask.
+
+    Raises:
+        ShapeError: If a number is not finite, which JSON cannot say.
     """
     height, width = perception.size
+    boxes, moment = perception.boxes, perception.timestamp
+    if boxes is not None and not (np.isfinite(boxes.xyxy).all() and np.isfinite(boxes.confidence).all()):
+        raise ShapeError("boxes hold numbers that are not finite, which JSON cannot say")
+    if moment is not None and not math.isfinite(moment):
+        raise ShapeError(f"timestamp must be finite seconds, got {moment}")
     return {
         "schema": SCHEMA_VERSION,
-        "source": perception.source,
-        "frame": perception.frame,
-        "timestamp": None if perception.timestamp is None else round(perception.timestamp, 6),
-        "size": {"height": height, "width": width},
+        "source": None if perception.source is None else str(perception.source),
+        "frame": None if perception.frame is None else int(perception.frame),
+        "timestamp": None if moment is None else round(float(moment), 6),
+        "size": {"height": int(height), "width": int(width)},
         "class_names": list(perception.class_names),
         "boxes": None if perception.boxes is None else _boxes_to_list(perception.boxes, perception.class_names),
         "drivable": None if perception.drivable is None else encode_mask(perception.drivable),
@@ -88,26 +98,32 @@ def perception_from_dict(mapping: dict[str, Any]) -> Perception:
     """
     try:
         version = str(mapping["schema"])
+        if not re.fullmatch(r"[1-9]\d*\.\d+", version):
+            raise ShapeError(f"schema must be a version such as {SCHEMA_VERSION}, got {version!r}")
         if int(version.partition(".")[0]) > int(SCHEMA_VERSION.partition(".")[0]):
             raise ShapeError(f"schema {version} is newer than {SCHEMA_VERSION}, which this version reads; upgrade")
         boxes, drivable, lane = (mapping.get(name) for name in ("boxes", "drivable", "lane"))
-        size = (int(mapping["size"]["height"]), int(mapping["size"]["width"]))
-        names, timestamp = mapping["class_names"], mapping.get("timestamp")
+        size = (_whole(mapping["size"]["height"], "height"), _whole(mapping["size"]["width"], "width"))
+        names, timestamp, source, frame = (
+            mapping.get(name) for name in ("class_names", "timestamp", "source", "frame")
+        )
         if min(size) < 1:
             raise ShapeError(f"size must be at least 1x1, got {size[1]}x{size[0]}")
+        if boxes is not None and not isinstance(boxes, list):
+            raise ShapeError(f"boxes must be a list or null, got {boxes!r}")
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ShapeError(f"class_names must be a list of texts, got {names!r}")
-        if timestamp is not None and not isinstance(timestamp, (int, float)):
-            raise ShapeError(f"timestamp must be seconds or null, got {timestamp!r}")
+        if source is not None and not isinstance(source, str):
+            raise ShapeError(f"source must be a text or null, got {source!r}")
         return Perception(
             size=size,
             class_names=tuple(names),
             boxes=None if boxes is None else _boxes_from_list(boxes),
             drivable=None if drivable is None else decode_mask(drivable),
             lane=None if lane is None else decode_mask(lane),
-            source=mapping.get("source"),
-            frame=mapping.get("frame"),
-            timestamp=timestamp,
+            source=source,
+            frame=None if frame is None else _whole(frame, "frame"),
+            timestamp=None if timestamp is None else _number(timestamp, "timestamp"),
         )
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         if isinstance(error, ShapeError):
@@ -132,9 +148,22 @@ def _boxes_to_list(boxes: Boxes, class_names: tuple[str, ...]) -> list[dict[str,
 
 def _boxes_from_list(rows: list[dict[str, Any]]) -> Boxes:
     tracked = any("track_id" in row for row in rows)
+    corners = [[_number(value, "xyxy") for value in row["xyxy"]] for row in rows]
     return Boxes(
-        xyxy=np.array([row["xyxy"] for row in rows], np.float32).reshape(-1, 4),
-        confidence=np.array([row["confidence"] for row in rows], np.float32),
-        class_id=np.array([row["class_id"] for row in rows], np.int64),
-        track_id=np.array([row.get("track_id", -1) for row in rows], np.int64) if tracked else None,
+        xyxy=np.array(corners, np.float32).reshape(-1, 4),
+        confidence=np.array([_number(row["confidence"], "confidence") for row in rows], np.float32),
+        class_id=np.array([_whole(row["class_id"], "class_id") for row in rows], np.int64),
+        track_id=np.array([_whole(row.get("track_id", -1), "track_id") for row in rows], np.int64) if tracked else None,
     )
+
+
+def _whole(value: Any, name: str) -> int:
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise ShapeError(f"{name} must be a whole number, got {value!r}")
+    return value
+
+
+def _number(value: Any, name: str) -> float:
+    if not isinstance(value, (int, float)) or isinstance(value, bool) or not math.isfinite(value):
+        raise ShapeError(f"{name} must be a finite number, got {value!r}")
+    return value
