@@ -21,6 +21,16 @@ from trilitenet.errors import ConfigError, OutputError, WeightsError
 from trilitenet.models.weights import import_published, read_card, rename_published, save_network
 
 
+def test_who_may_read_new_weights_is_as_the_process_makes_files(tmp_path: Path) -> None:
+    network = build_network("tiny")
+    before = os.umask(0o022)
+    try:
+        save_network(network, tmp_path / "net.safetensors", network.card)
+    finally:
+        os.umask(before)
+    assert (tmp_path / "net.safetensors").stat().st_mode & 0o777 == 0o644
+
+
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
     network = build_network("tiny")
