@@ -73,3 +73,9 @@ def test_a_schema_is_missing_wrong_or_newer(change: dict[str, object], message: 
         del mapping["schema"]
         with pytest.raises(WeightsError, match=f"^file: .*{message}"):
             cls.from_json(json.dumps(mapping | change), "file")
+
+
+@pytest.mark.parametrize("scale", [0, 3])
+def test_masks_are_as_large_as_the_input_or_twice_that(scale: int) -> None:
+    with pytest.raises(ConfigError, match=f"mask_scale must be 1 or 2, got {scale}"):
+        ArtefactInfo("onnx", mask_scale=scale)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Literal
 
@@ -9,8 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.artefacts import Artefacts
+from tests.fakes import ColourBackend
 from trilitenet.commands.benchmark import benchmark
 from trilitenet.errors import ConfigError, OutputError
+from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.torch_backend import TorchBackend
 from trilitenet.structures import RawOutputs
 
@@ -108,3 +111,21 @@ def test_whole_frames_take_the_size_asked_for(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(TorchBackend, "run", run)
     benchmark("tiny", stage="frame", device="cpu", rounds=1, warmup=0, size=(64, 128), source=(72, 128))
     assert set(seen) == {(1, 96, 128, 3)}
+
+
+def test_a_ratio_above_1_is_faster_than_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Resting(ColourBackend):
+        """A backend that takes so many seconds a batch."""
+
+        def __init__(self, seconds: float) -> None:
+            super().__init__()
+            self.seconds = seconds
+
+        def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
+            time.sleep(self.seconds)
+            return super().run(batch)
+
+    monkeypatch.setattr("trilitenet.commands.benchmark.load", lambda model, **_: Predictor(Resting(float(model))))
+    first, second = benchmark("0.1", "0.01", rounds=3, warmup=0, size=(32, 64)).timings
+    assert first.ratio == 1
+    assert second.ratio > 2

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,8 +18,9 @@ from trilitenet.commands.score import score
 from trilitenet.config import ARTEFACT_KEY, ModelCard
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.synthetic_files import write_dataset
+from trilitenet.engine.provenance import hash_files
 from trilitenet.engine.report import Report
-from trilitenet.errors import ConfigError, DataError, OutputError
+from trilitenet.errors import ConfigError, DataError, OutputError, WeightsError
 from trilitenet.models.trilitenet import build_network
 from trilitenet.models.weights import save_network
 
@@ -229,3 +231,33 @@ def test_a_file_of_bytes_is_no_report_in_one_short_line(tmp_path: Path, capsys: 
     assert "not a report" in message
     assert "UnicodeDecodeError" in message
     assert len(message) < 400 + len(str(tmp_path))
+
+
+def test_the_hash_of_files_does_not_hang_on_their_order(tmp_path: Path) -> None:
+    paths = [tmp_path / name for name in ("a.bin", "b.param")]
+    for path in paths:
+        path.write_text(path.name)
+    assert hash_files(paths) == hash_files(paths[::-1])
+
+
+def test_what_is_asked_of_the_model_reaches_it(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: dict[str, object] = {}
+
+    def load(model: str, **options: object) -> None:
+        given.update(options, model=model)
+        raise WeightsError("far enough")
+
+    monkeypatch.setattr("trilitenet.commands.evaluate.load", load)
+    asked: dict[str, Any] = {
+        "device": "cpu", "backend": "openvino", "confidence": 0.1, "iou": 0.2, "drivable": 0.3, "lane": 0.4,
+        "long_side": 320,
+    }  # fmt: skip
+    with pytest.raises(WeightsError, match="far enough"):
+        evaluate("m.onnx", data=data, **asked)
+    assert given == {**asked, "model": "m.onnx"}
+
+
+def test_the_hash_of_the_data_is_of_the_images_measured_on(data: Path) -> None:
+    dataset = DrivingDataset(data, "val")
+    few = DrivingDataset(data, "val", names=dataset.names[:2])
+    assert hash_dataset(dataset, 2) == hash_dataset(few) != hash_dataset(dataset)

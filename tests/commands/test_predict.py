@@ -470,3 +470,28 @@ sys.exit(report.exit_code)
     frames = json.loads((output / "drive.json").read_text())["frames"]
     assert 0 < len(frames) < 600
     assert len(list(VideoReader(output / "drive.mp4"))) == len(frames)
+
+
+def test_hidden_parts_are_not_drawn(folder: Path, tmp_path: Path, predictor: Predictor) -> None:
+    apart = {}
+    for hide in ((), ("drivable", "lane", "boxes")):
+        output = tmp_path / f"without-{len(hide)}"
+        predict_with(predictor, [folder / "alpha.png"], output, hide=hide)
+        overlay = np.asarray(Image.open(output / "alpha.jpg"))
+        apart[len(hide)] = float(np.abs(overlay.astype(int) - coloured_scene()).mean())
+    assert apart[3] < 2 < 5 < apart[0]
+
+
+def test_what_is_asked_of_the_model_reaches_it(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: dict[str, object] = {}
+
+    def load(model: str, **options: object) -> Predictor:
+        given.update(options, model=model)
+        return Predictor(ColourBackend())
+
+    monkeypatch.setattr("trilitenet.commands.predict.load", load)
+    asked = {"model": "m.onnx", "device": "cpu", "backend": "openvino", "confidence": 0.4, "long_side": 320}
+    words = [word for name, value in asked.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+    output = str(tmp_path / "out")
+    assert cli.main(["predict", str(folder / "alpha.png"), *words, "--batch-size", "2", "--output", output]) == 0
+    assert given == {**asked, "batch_size": 2}

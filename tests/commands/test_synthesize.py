@@ -2,7 +2,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from trilitenet.apps.cli import main
 
@@ -35,3 +37,13 @@ def test_wrong_options_leave_nothing(
     assert main(["data", "synthesize", str(tmp_path / "out"), *words]) == 1
     assert capsys.readouterr().err.startswith(f"error: {message}")
     assert not (tmp_path / "out").exists()
+
+
+def test_lanes_are_lines_or_paint_as_asked(tmp_path: Path) -> None:
+    pixels = {}
+    for labels in ("lines", "paint"):
+        words = ["data", "synthesize", str(tmp_path / labels), "--count", "1", "--size", "96", "160"]
+        assert main([*words, "--labels", labels]) == 0
+        (path,) = (tmp_path / labels / "ll_seg_annotations").rglob("*.png")
+        pixels[labels] = int((np.asarray(Image.open(path)) > 0).sum())
+    assert pixels["paint"] < pixels["lines"]

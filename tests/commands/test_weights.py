@@ -9,10 +9,12 @@ from typing import Any
 import pytest
 import torch
 from numpy.typing import NDArray
+from safetensors.torch import load_file
 
 from tests.models.conftest import golden as golden
 from tests.models.conftest import published_state
 from trilitenet.apps.cli import main
+from trilitenet.commands.evaluate import evaluate
 from trilitenet.commands.synthesize import synthesize
 from trilitenet.commands.weights import finish, import_weights, info
 from trilitenet.config import shipped_weights
@@ -123,3 +125,13 @@ def test_every_shipped_file_says_what_it_is() -> None:
         assert "non-commercial" in card.licence
         assert {"recipe", "seed", "hours", "hardware", "labels"} <= card.provenance.keys()
         assert 0 < card.metrics["val fair/drivable/iou"] < 1
+
+
+def test_the_figures_are_those_of_the_file_which_is_fp16_unless_asked_otherwise(scenes: Path, tmp_path: Path) -> None:
+    for full, dtype in ((False, torch.float16), (True, torch.float32)):
+        out = tmp_path / f"{full}.safetensors"
+        card = finish("tiny", out, data=scenes, input_size=(192, 320), full=full)
+        assert {tensor.dtype for tensor in load_file(out).values() if tensor.is_floating_point()} == {dtype}
+        report = evaluate(str(out), data=scenes, resamples=0, worst=0)
+        figures = {f"val {name}": round(figure.value, 4) for name, figure in report.figures.items()}
+        assert card.metrics == pytest.approx(figures, nan_ok=True)

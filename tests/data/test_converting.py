@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -11,7 +12,7 @@ import pytest
 from PIL import Image
 
 from tests.formats.readers import raw_bdd
-from trilitenet.data.converting import ConversionOptions, convert
+from trilitenet.data.converting import ConversionOptions, convert, lane_mask
 from trilitenet.data.description import read_description
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.records import AreaLabel, CocoRuns, ImageRecord, LaneLabel, MaskFile, ObjectLabel, RowRuns
@@ -344,3 +345,25 @@ def test_mask_pictures_of_every_depth(tmp_path: Path, mode: str, values: dict[in
     record = picture(tmp_path / "raw/a.png", lane=MaskFile(tmp_path / "mask.png", values))
     convert(Records(train=[record]), tmp_path / "out")
     np.testing.assert_array_equal(DrivingDataset(tmp_path / "out", "train")[0].lane, truth)
+
+
+def test_gaps_and_widths_are_those_of_an_image_1280_pixels_wide() -> None:
+    y = np.arange(100.0, 341.0, 20.0)
+    edges = [LaneLabel("single white", np.stack([np.full_like(y, x), y], axis=1), edge=True) for x in (300.0, 330.0)]
+    for width, drawn, pixels in ((1280, {"pairs": 1}, 8), (640, {"single lines": 2}, 2 * 4)):
+        mask, found, _ = lane_mask(edges, (360, width), 8.0, ConversionOptions())
+        assert found == drawn
+        assert np.count_nonzero(mask[200]) == pixels
+
+
+def test_an_interrupted_copy_of_an_image_is_not_taken_for_it(
+    raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(source: Path, target: Path) -> None:
+        target.write_bytes(source.read_bytes()[:100])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(shutil, "copy2", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        convert(read_bdd100k(raw), tmp_path / "out", ConversionOptions(images="copy"))
+    assert not list((tmp_path / "out" / "images").rglob("[!.]*.jpg"))

@@ -78,3 +78,10 @@ def test_dashes_side_by_side_pair_within_each_dash() -> None:
 def test_more_lines_than_are_paired_exactly() -> None:
     lines = [np.array([[x + 30.0 * n, 0.0], [x + 30.0 * n, 300.0]]) for n in range(9) for x in (0.0, 6.0)]
     assert pair_edges(lines).pairs == tuple((2 * n, 2 * n + 1) for n in range(9))
+
+
+def test_of_many_edges_the_nearest_are_paired_first() -> None:
+    y = np.arange(0.0, 301.0, 20.0)
+    left = [np.stack([np.full_like(y, 14.0 * number), y], axis=1) for number in range(7)]
+    right = [line + np.array([4.0, 0.0]) for line in left]
+    assert pair_edges([*left, *right], max_gap=20.0).pairs == tuple((number, number + 7) for number in range(7))

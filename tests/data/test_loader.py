@@ -190,3 +190,11 @@ def test_no_process_is_left_without_an_image(dataset: DrivingDataset) -> None:
     with pytest.raises(ConfigError, match="2 of 14 images are left for a last batch, too few for 3 processes"):
         build_loader(dataset, EvalTransform(CANVAS), batch_size=6, shuffle=False, share=(0, 3))
     assert len(build_loader(dataset, EvalTransform(CANVAS), batch_size=6, share=(0, 3))) == 2
+
+
+def test_an_image_is_augmented_anew_in_every_epoch(dataset: DrivingDataset) -> None:
+    alone = DrivingDataset(dataset.root, "train", names=dataset.names[:1])
+    loader = build_loader(alone, TrainTransform(CANVAS), batch_size=1, seed=3)
+    (first,), (second,) = loader.epoch(0), loader.epoch(1)
+    assert first.names == second.names
+    assert not torch.equal(first.images, second.images)

@@ -282,3 +282,23 @@ def test_whether_a_task_is_labelled_is_known(root: Path, tmp_path: Path) -> None
     for dataset in (DrivingDataset(root, "train"), PreparedDataset(tmp_path / "out", "train")):
         assert [dataset.has_labels(task) for task in ("detection", "drivable", "lane")] == [True, True, False]
     assert not PreparedDataset(tmp_path / "out", "train", tasks=("lane",)).has_labels("detection")
+
+
+def test_images_that_are_gone_are_gone_from_the_prepared_copy_too(root: Path, tmp_path: Path) -> None:
+    prepare(root, tmp_path / "out", canvas=CANVAS, splits=["train"], shard_size=4)
+    names = sorted(path.stem for path in (root / "images/train").iterdir())
+    for name in names[4:]:
+        (root / f"images/train/{name}.jpg").unlink()
+    prepare(root, tmp_path / "out", canvas=CANVAS, splits=["train"], shard_size=4)
+    assert PreparedDataset(tmp_path / "out", "train").names == names[:4]
+    assert len(list((tmp_path / "out").glob("train-*"))) == 2  # a shard and its index
+
+
+def test_names_that_differ_in_an_escape_alone_are_two(root: Path, tmp_path: Path) -> None:
+    folder = root / "images" / "test"
+    folder.mkdir()
+    for number, name in enumerate(("a.b", "a%2Eb")):
+        cv2.imwrite(str(folder / f"{name}.png"), np.full((64, 96, 3), 100 * number, np.uint8))
+    prepare(root, tmp_path / "out", canvas=CANVAS, splits=["test"])
+    packed = PreparedDataset(tmp_path / "out", "test")
+    assert {sample.name: int(sample.image.max()) for sample in packed} == {"a.b": 0, "a%2Eb": 100}

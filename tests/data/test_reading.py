@@ -250,3 +250,18 @@ def test_an_image_of_an_absurd_size_is_a_broken_one() -> None:
         decode_image(data, "huge.png")
     with pytest.raises(DataError, match=r"huge\.png: not a mask"):
         decode_mask(data, "huge.png", MaskMeaning())
+
+
+def test_of_two_ego_masks_that_fit_a_name_the_one_that_says_more_of_it_counts(root: Path) -> None:
+    for name, rows in (("all.png", 10), ("first.png", 20)):
+        own = np.zeros((72, 128), np.uint8)
+        own[:rows] = 255
+        cv2.imwrite(str(root / name), own)
+    (root / "dataset.yaml").write_text("ego_masks: {train_: all.png, train_0000: first.png}\n")
+    dataset = DrivingDataset(root, "train")
+    found = []
+    for index in (0, 1):
+        valid = dataset[index].valid
+        assert valid is not None
+        found.append(int((~valid).all(axis=1).sum()))
+    assert found == [20, 10]

@@ -324,3 +324,21 @@ def test_settings_are_checked() -> None:
         Augmentation(rotation=-1)
     with pytest.raises(ConfigError, match="mask_above"):
         Augmentation(mask_above=255)
+
+
+def test_the_shifts_of_the_two_axes_are_drawn_apart(rng: np.random.Generator) -> None:
+    shifts = np.array([draw_affine(rng, Augmentation()).shift for _ in range(200)])
+    assert abs(np.corrcoef(shifts.T)[0, 1]) < 0.3
+
+
+def test_of_an_ignored_region_what_is_left_stays_ignored_however_little() -> None:
+    sample = marked(at=(0.5, 0.5), side=0.2)
+    moved = warp(sample, Affine(shift=(0.58, 0.0)), CANVAS)  # a twentieth of it is left
+    assert moved.boxes is not None
+    assert len(moved.boxes) == 0
+    assert len(moved.ignored) == 1
+
+
+def test_mixup_keeps_the_ignored_regions_of_both(rng: np.random.Generator) -> None:
+    one, two = marked(CANVAS, (0.2, 0.5)), marked(CANVAS, (0.8, 0.5))
+    np.testing.assert_array_equal(mixup(one, two, rng).ignored, np.concatenate([one.ignored, two.ignored]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -168,3 +169,9 @@ def test_attention_on_openvino_is_exact(channels: int, channels_last: bool) -> N
     compiled = openvino_core(openvino).compile_model(model, "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
     got = compiled([x.numpy()])[0]
     assert np.abs(got - wanted.numpy()).max() < 1e-4
+
+
+def test_pixels_are_normalised_as_the_card_says() -> None:
+    network = lively_network()
+    network.card = dataclasses.replace(network.card, mean=(0.1, 0.2, 0.3), std=(0.5, 0.6, 0.7))
+    check(network)

@@ -81,3 +81,37 @@ def test_another_class_fails_though_the_box_is_the_same() -> None:
 
     assert failures(rows) == []
     assert "boxes agree" in failures(swapped)[0]
+
+
+def test_the_worse_of_the_two_masks_decides() -> None:
+    same = np.zeros((1, 32, 64), np.uint8)
+    other = same.copy()
+    other[:, :2] = 255
+    one, changed = RawOutputs(None, same, same), RawOutputs(None, same, other)
+    found = compare(lambda _: one, lambda _: changed, [CANVAS], STRICT)
+    assert found.pixels == 30 / 32
+    assert "mask pixels agree" in found.failures[0]
+
+
+def test_a_box_at_the_very_threshold_is_looked_for_on_both_sides_of_it() -> None:
+    above, below = (
+        RawOutputs(np.array([[[20, 15, 16, 10, score, 1.0]]], np.float32), None, None) for score in (0.31, 0.24)
+    )
+    loose = Tolerance(pixels=0.999, boxes=0.99, confidence=0.1)
+    found = compare(lambda _: above, lambda _: below, [CANVAS], loose, confidence=0.25)
+    assert found.boxes == 1.0
+
+
+def test_masks_are_compared_at_their_thresholds() -> None:
+    one, other = (RawOutputs(None, None, np.full((1, 32, 64), level, np.uint8)) for level in (240, 200))
+    for threshold, pixels in ((0.5, 1.0), (0.9, 0.0)):
+        found = compare(lambda _: one, lambda _: other, [CANVAS], STRICT, masks=(0.5, threshold))
+        assert found.pixels == pixels
+
+
+def test_a_speck_must_be_at_its_place_to_half_a_pixel() -> None:
+    specks = [
+        RawOutputs(np.array([[[left, 15, 1, 1, 0.9, 0.9]]], np.float32), None, None) for left in (20.0, 20.25, 22.0)
+    ]
+    shares = [compare(lambda _: specks[0], lambda _, one=one: one, [CANVAS], STRICT).boxes for one in specks]  # type: ignore[misc]
+    assert shares == [1.0, 1.0, 0.0]

@@ -8,6 +8,7 @@ import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -284,3 +285,75 @@ def test_a_backend_that_runs_in_parallel_changes_no_figure() -> None:
     with pytest.raises(BackendError, match="gone"):
         evaluate(FakePredictor(backend), images, resamples=0)
     assert backend.inside == 0
+
+
+def test_the_worst_images_are_the_worst_of_all() -> None:
+    images = Images()
+    few, every = (
+        evaluate(fake_predictor(images, drift=4), images, resamples=0, worst=count).worst for count in (3, len(images))
+    )
+    for task in ("detection", "drivable"):
+        scores = [frame.score for frame in every if frame.task == task]
+        assert scores[0] < scores[-1]
+        assert [frame.score for frame in few if frame.task == task] == scores[:3]
+
+
+def test_thresholds_are_not_told_from_what_does_not_count() -> None:
+    images = Images()
+    predictor = fake_predictor(images)
+    run = predictor.backend.run
+
+    def unsure(batch: np.ndarray) -> RawOutputs:
+        raw = run(batch)
+        assert raw.drivable is not None
+        return dataclasses.replace(raw, drivable=np.where(raw.drivable == 255, 80, 60).astype(np.uint8))
+
+    predictor.backend.run = unsure  # type: ignore[method-assign]
+    plain = best_thresholds(predictor, images)
+    for index, sample in enumerate(images._samples):  # wrong labels on the own car, which is the lower half
+        assert sample.drivable is not None
+        valid = np.ones(sample.drivable.shape, np.bool_)
+        valid[:, :40] = False
+        drivable = np.where(valid, sample.drivable, 1 - sample.drivable).astype(np.uint8)
+        images._samples[index] = dataclasses.replace(sample, drivable=drivable, valid=valid)
+    found = best_thresholds(predictor, images)
+    assert found.drivable_iou == plain.drivable_iou == 1.0
+
+
+def test_the_best_threshold_lies_just_below_the_best_value() -> None:
+    images = Images()
+    predictor = fake_predictor(images)
+    run = predictor.backend.run
+
+    def close(batch: np.ndarray) -> RawOutputs:
+        raw = run(batch)
+        assert raw.drivable is not None
+        return dataclasses.replace(raw, drivable=np.where(raw.drivable == 255, 80, 79).astype(np.uint8))
+
+    predictor.backend.run = close  # type: ignore[method-assign]
+    predictor.thresholds = best_thresholds(predictor, images).thresholds
+    assert values(evaluate(predictor, images, resamples=0))["fair/drivable/iou"] == 1.0
+
+
+def test_saved_masks_count_in_the_paper_protocol_where_half_a_pixel_is_foreground(tmp_path: Path) -> None:
+    images = Images(1)
+    true = np.zeros((720, 1280), np.uint8)
+    true[400:, 200:1000] = 1
+    images._samples = [
+        dataclasses.replace(images[0], image=np.zeros((720, 1280, 3), np.uint8), drivable=true, lane=None)
+    ]
+    (tmp_path / "drivable").mkdir()
+    saved = true * np.uint8(255)
+    saved[100:300:4, ::4] = 255  # a quarter of a pixel of the canvas each
+    cv2.imwrite(str(tmp_path / "drivable" / "000.png"), saved)
+    report = score_predictions(SavedPredictions(tmp_path, ("vehicle",)), images, protocol="paper", resamples=0)
+    assert values(report)["paper/drivable/iou"] == 1.0
+
+
+def test_a_single_class_may_be_called_otherwise_by_the_labels() -> None:
+    images = Images(2)
+    images.class_names = ("car",)
+    scores = evaluate(fake_predictor(images), images, resamples=0).fair
+    assert scores is not None
+    assert scores.detection is not None
+    assert scores.detection.ap50 == pytest.approx(1.0)

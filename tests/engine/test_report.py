@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from tests.engine.labelled import Images, fake_predictor
 from trilitenet.engine.compare import compare_reports
@@ -17,6 +18,7 @@ from trilitenet.engine.published_rows import PUBLISHED_ROWS
 from trilitenet.engine.report import Report, read_report
 from trilitenet.engine.robustness import CORRUPTED, corrupted_figures, figures_by_size
 from trilitenet.errors import ConfigError, DataError, OutputError
+from trilitenet.processing.letterbox import Letterbox
 
 
 @pytest.fixture(scope="module")
@@ -203,3 +205,23 @@ def test_input_sizes_are_swept(tmp_path: Path) -> None:
 def test_undefined_figures_are_a_dash() -> None:
     assert percent(float("nan")) == percent(None) == "-"
     assert percent(np.float64(0.1234)) == "12.3"
+
+
+def test_every_image_has_noise_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    images = Images(3)
+    coded = images[1].image
+    images._samples = [dataclasses.replace(images[index], image=np.full_like(coded, 100)) for index in (1, 2)]
+    predictor = fake_predictor(images)
+    seen: list[NDArray[np.uint8]] = []
+    plain = predictor.preprocess
+
+    def preprocess(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Letterbox]:
+        seen.append(image)
+        return plain(coded)  # the fake network reads the number of the image in it
+
+    monkeypatch.setattr(predictor, "preprocess", preprocess)
+    clean = evaluate(predictor, images, resamples=0)
+    corrupted_figures(predictor, images, clean, corruptions=("gaussian_noise",), severities=(3,))
+    assert len(seen) == 4
+    assert np.array_equal(seen[0], seen[1])
+    assert not np.array_equal(seen[2], seen[3])

@@ -129,3 +129,11 @@ def test_thresholds_that_a_file_fixes_inside_are_refused() -> None:
     assert Predictor(backend, dataclasses.replace(own, confidence=0.01)).least_confidence == 0
     with pytest.raises(ConfigError, match="--masks probability"):
         Predictor(backend, dataclasses.replace(own, lane=0.9))
+
+
+def test_images_are_resized_as_in_training_unless_told_otherwise() -> None:
+    backend = ColourBackend()
+    backend.card = dataclasses.replace(backend.card, input_size=(192, 320))
+    Predictor(backend)(coloured_scene())
+    Predictor(backend, long_side=640)(coloured_scene())
+    assert backend.batches == [(1, 192, 320, 3), (1, 384, 640, 3)]

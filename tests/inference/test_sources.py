@@ -546,3 +546,18 @@ def test_standard_input_is_opened_once_though_its_first_frame_is_late(monkeypatc
     monkeypatch.setattr("trilitenet.inference.sources._frames_of", lambda *_: iter(late))
     assert [frame.timestamp for frame in VideoReader("-")] == [0.1, 0.2]
     assert opened == ["-"]
+
+
+def test_rtsp_comes_over_tcp_which_loses_no_packets(monkeypatch: pytest.MonkeyPatch) -> None:
+    av = pytest.importorskip("av")
+    options: list[dict[str, str]] = []
+
+    def refuse(path: str, **settings: Any) -> None:
+        options.append(settings["options"])
+        raise OSError("nobody is there")
+
+    monkeypatch.setattr(av, "open", refuse)
+    for url in ("rtsp://127.0.0.1/live", "http://127.0.0.1/live.ts"):
+        with pytest.raises(InputError, match="nobody is there"):
+            list(StreamReader(url))
+    assert options == [{"rtsp_transport": "tcp"}, {}]

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -103,3 +104,15 @@ def test_batches_are_checked_and_left_as_they_are() -> None:
     lane = backend.run(image[..., ::-1]).lane
     assert lane is not None
     np.testing.assert_array_equal(lane, backend.run(np.ascontiguousarray(image[..., ::-1])).lane)
+
+
+def test_pixels_are_normalised_as_the_card_says(rng: np.random.Generator) -> None:
+    network = build_network("tiny", tasks=("lane",)).eval()
+    network.card = dataclasses.replace(network.card, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0))
+    batch = rng.integers(0, 256, (1, 64, 96, 3), dtype=np.uint8)
+    with torch.no_grad():
+        lane = network(torch.from_numpy((batch / 255).transpose(0, 3, 1, 2)).float()).lane
+    found = TorchBackend(network, "cpu").run(batch).lane
+    assert lane is not None
+    assert found is not None
+    assert np.abs(found - lane.softmax(1)[:, 1].numpy() * 255).max() <= 0.51

@@ -306,3 +306,13 @@ def test_frame_is_what_it_says() -> None:
     frame = next(iter(Scenes(1)))
     assert isinstance(frame, Frame)
     assert (frame.index, frame.timestamp, frame.source) == (0, 0.0, "scenes")
+
+
+def test_a_lower_quality_makes_a_smaller_file(tmp_path: Path) -> None:
+    sizes = []
+    for quality in (10, 45):
+        with VideoWriter(tmp_path / f"{quality}.mp4", quality=quality) as writer:
+            for seed in range(5):
+                writer.write(np.random.default_rng(seed).integers(0, 256, (96, 160, 3), np.uint8))
+        sizes.append((tmp_path / f"{quality}.mp4").stat().st_size)
+    assert sizes[0] > 2 * sizes[1]

@@ -80,3 +80,15 @@ def test_other_classes_are_refused_unless_boxes_are_left_out() -> None:
     with pytest.raises(ConfigError, match="other classes"):
         DistillationLoss(ANCHORS, ANCHORS)(outputs(0), outputs(1, classes=3))
     assert float(DistillationLoss(ANCHORS, ANCHORS, (0.0, 1.0, 1.0))(outputs(0), outputs(1, classes=3)).detection) == 0
+
+
+def test_boxes_count_where_the_teacher_sees_an_object() -> None:
+    teacher = torch.zeros(1, 1, 1, 2, 6)
+    teacher[..., 4] = torch.tensor([20.0, -20.0])  # sure of the first cell, nothing in the second
+    anchors = torch.ones(1, 2)
+    there, elsewhere = teacher.clone(), teacher.clone()
+    there[..., 0, :4] = 3.0
+    elsewhere[..., 1, :4] = 3.0
+    same, off, wrong = (float(distil_boxes(one, teacher, anchors, anchors)) for one in (teacher, elsewhere, there))
+    assert off == pytest.approx(same, abs=1e-6)
+    assert wrong > same + 0.01

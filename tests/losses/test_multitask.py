@@ -117,3 +117,15 @@ def test_uncertainty_weighting_learns_nothing_of_a_task_without_labels() -> None
     assert parameter.grad is not None
     assert parameter.grad[2] == 0
     assert (parameter.grad[:2] != 0).all()
+
+
+def test_uncertainty_weighting_learns_nothing_of_boxes_that_nobody_labelled() -> None:
+    outputs, batch = case()
+    nobody = torch.zeros(2, dtype=torch.bool)
+    bare = dataclasses.replace(batch, boxes=torch.zeros(0, 6), detection_labelled=nobody)
+    loss = MultiTaskLoss(DetectionLoss(ANCHORS, 1), balancing="uncertainty")
+    loss(outputs, bare).total.backward()
+    (parameter,) = loss.parameters()
+    assert parameter.grad is not None
+    assert parameter.grad[0] == 0
+    assert (parameter.grad[1:] != 0).all()

@@ -231,3 +231,22 @@ def test_what_does_not_fit_is_refused_and_nothing_of_it_is_kept(metric: Detectio
         with pytest.raises(ShapeError):
             metric.update(box, scores, class_id, truth, truth_class)  # type: ignore[arg-type]
     assert len(metric) == 0
+
+
+def test_a_box_at_the_very_overlap_is_right_and_one_at_the_very_confidence_does_not_count() -> None:
+    truth = np.array([[0, 0, 10, 10]], np.float32)
+    half = np.array([[0, 0, 10, 5]], np.float32)
+    metric = DetectionMetric(confidence=0.5)
+    assert metric.update(half, np.array([0.5]), np.zeros(1, np.int64), truth, np.zeros(1, np.int64)) == (0, 0, 1)
+    scores = metric.compute()
+    assert scores.ap50 == pytest.approx(1)
+    assert scores.at.recall == 0
+
+
+def test_boxes_beyond_the_stated_number_do_not_count() -> None:
+    truth = np.array([[0, 0, 10, 10]], np.float32)
+    boxes = np.concatenate([truth + 50, truth])  # the right one comes second
+    for most, recall in ((1, 0.0), (2, 1.0)):
+        metric = DetectionMetric(max_boxes=most)
+        metric.update(boxes, np.array([0.9, 0.8]), np.zeros(2, np.int64), truth, np.zeros(1, np.int64))
+        assert metric.compute().recall_all == recall

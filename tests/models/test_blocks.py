@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
 
-from trilitenet.config import VARIANTS
+from trilitenet.config import STRIDES, VARIANTS
 from trilitenet.data.batches import collate
 from trilitenet.data.synthetic import SyntheticScenes
 from trilitenet.data.transforms import EvalTransform
@@ -14,6 +16,7 @@ from trilitenet.losses.detection import DetectionLoss
 from trilitenet.losses.multitask import MultiTaskLoss
 from trilitenet.models.attention import merge_bins, split_bins
 from trilitenet.models.blocks import DepthwiseESP, DilatedConv, StrideESP
+from trilitenet.models.detection import DetectionHead
 from trilitenet.models.encoder import Encoder
 from trilitenet.models.trilitenet import build_network, normalise_images
 
@@ -117,3 +120,11 @@ def test_bf16_gradient_of_the_network_is_no_worse_in_channels_last(variant: str)
     assert np.isfinite(errors).all()
     assert errors[1] < 0.3
     assert errors[2] < 1.5 * errors[1]
+
+
+def test_a_fresh_head_expects_eight_objects_an_image() -> None:
+    head = DetectionHead(64, 1)
+    for conv, stride in zip(head.convs, STRIDES, strict=True):
+        assert isinstance(conv.bias, torch.Tensor)
+        objectness = conv.bias.detach().view(3, -1)[:, 4]
+        assert objectness.tolist() == pytest.approx([math.log(8 / (640 / stride) ** 2)] * 3, abs=0.2)

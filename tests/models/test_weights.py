@@ -259,3 +259,9 @@ def test_a_published_checkpoint_of_odd_tensors_is_named(tmp_path: Path) -> None:
 def test_a_card_that_cannot_be_used_is_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         ModelCard("tiny", **wrong)
+
+
+def test_a_published_checkpoint_saved_by_a_distributed_run(golden: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    state = {f"module.{key}": value for key, value in published_state("tiny", golden).items()}
+    torch.save(state, tmp_path / "published.pth")
+    assert import_published(tmp_path / "published.pth", tmp_path / "ours.safetensors").variant == "tiny"

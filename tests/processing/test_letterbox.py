@@ -115,3 +115,11 @@ def test_wrong_sizes_are_refused() -> None:
         letterbox.mask(np.zeros((720, 1280), np.float32))
     with pytest.raises(ConfigError, match="positive"):
         Letterbox.fit((0, 640))
+
+
+def test_an_image_that_grows_has_no_steps() -> None:
+    image = np.zeros((180, 320, 3), np.uint8)
+    image[:, 160:] = 200
+    letterbox = Letterbox.fit((180, 320))
+    assert letterbox.resized == (360, 640)
+    assert len(np.unique(letterbox.image(image)[letterbox.inside])) > 2

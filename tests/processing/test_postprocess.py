@@ -6,7 +6,7 @@ import pytest
 from trilitenet.config import Thresholds
 from trilitenet.errors import ShapeError
 from trilitenet.processing.letterbox import Letterbox
-from trilitenet.processing.postprocess import to_perceptions
+from trilitenet.processing.postprocess import threshold_mask, to_perceptions
 from trilitenet.structures import RawOutputs
 
 LETTERBOX = Letterbox.fit((720, 1280))
@@ -77,3 +77,12 @@ def test_boxes_in_the_padding_take_no_place() -> None:
     boxes = to_perceptions(raw, [letterbox], Thresholds(max_boxes=1), ("vehicle",))[0].boxes
     assert boxes is not None
     np.testing.assert_allclose(boxes.confidence, [0.72])
+
+
+def test_a_probability_just_above_the_threshold_is_foreground() -> None:
+    letterbox = Letterbox.fit((32, 64), canvas=(32, 64))
+    mask = np.full((32, 64), 127, np.uint8)
+    mask[:, 32:] = 128  # 128 / 255 is above one half, 127 / 255 is not
+    found = threshold_mask(mask, letterbox, 0.5)
+    assert found[:, 32:].all()
+    assert not found[:, :32].any()

@@ -134,3 +134,12 @@ def test_what_is_not_that_form_is_refused(change: dict[str, Any]) -> None:
     mapping = copy.deepcopy(perception().to_dict()) | change
     with pytest.raises(ShapeError):
         Perception.from_dict(mapping)
+
+
+def test_a_box_without_an_identity_among_others_that_have_one_is_of_no_track() -> None:
+    document = perception(track=True).to_dict()
+    del document["boxes"][1]["track_id"]
+    boxes = Perception.from_dict(document).boxes
+    assert boxes is not None
+    assert boxes.track_id is not None
+    assert boxes.track_id.tolist() == [7, -1]

@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -172,3 +173,29 @@ def test_the_view_goes_there_and_back() -> None:
     points = np.array([[10.0, 2.0], [40.0, -5.0]])
     pixels = np.concatenate([view.to_pixels(points), np.ones((2, 1))], axis=1)
     np.testing.assert_allclose((pixels @ view.matrix.T)[:, :2], points)
+
+
+def test_a_camera_that_looks_to_the_left_is_told_so() -> None:
+    mounted = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03, yaw=0.05)
+    mask = np.zeros(mounted.size, np.uint8)
+    ahead = np.linspace(5.0, 60.0, 100)
+    for side in (1.75, -1.75):
+        pixels = mounted.to_pixels(np.stack([ahead, np.full_like(ahead, side)], axis=1))
+        cv2.polylines(mask, [np.round(pixels).astype(np.int32)], False, 1, 3)
+    lines = find_lines(mask)
+    calibration = SelfCalibration(mounted.size, still=True)
+    calibration.update(assign_positions(lines, [float(line.column(359.0)) - 319.5 for line in lines]))
+    assert calibration.camera is not None
+    assert calibration.camera.yaw == pytest.approx(0.05, abs=0.01)
+    assert calibration.camera.pitch == pytest.approx(0.03, abs=0.01)
+
+
+def test_the_picture_from_above_shows_a_line_across_the_road_straight_though_the_lens_bends_it() -> None:
+    ideal = Camera.from_field_of_view((360, 640), 70.0, 1.4, pitch=0.05)
+    camera = dataclasses.replace(ideal, distortion=(-0.3, 0.1, 0.0, 0.0))
+    points = np.stack([np.full(201, 8.0), np.linspace(-5.0, 5.0, 201)], axis=1)
+    image = np.zeros(camera.size, np.uint8)
+    cv2.polylines(image, [np.round(camera.to_pixels(points)).astype(np.int32)], False, 255, 3)
+    view = View(near=6.0, far=18.0, half_width=6.0, scale=20.0)
+    u, v = np.round(view.to_pixels(points)).astype(int).T
+    assert np.mean(birds_eye(image, camera, view)[v, u] > 120) > 0.95

@@ -6,7 +6,16 @@ import pytest
 
 from trilitenet.processing.geometry import Camera
 from trilitenet.road.camera import CameraErrors
-from trilitenet.road.ego import BOX_ERROR_SHARE, LaneFilter, LaneFit, LeadFilter, find_distances, fit_ego_lane
+from trilitenet.road.ego import (
+    BOX_ERROR_SHARE,
+    REAR_OVERHANG,
+    LaneFilter,
+    LaneFit,
+    LeadFilter,
+    find_distances,
+    find_lead,
+    fit_ego_lane,
+)
 from trilitenet.road.lanes import find_lines
 from trilitenet.road.structures import EgoLane, Estimate, LaneLine, LeadVehicle
 from trilitenet.structures import Boxes
@@ -207,3 +216,71 @@ def test_a_frame_outside_of_its_lane_is_passed_on_as_it_is() -> None:
     lanes.update(fit_of(0.0), 0.0)
     outside = fit_of(2.5)._replace(seen=None)
     assert lanes.update(outside, 0.2) is outside.lane
+
+
+def test_a_vehicle_cut_off_below_is_no_lead_and_has_no_distance() -> None:
+    fit = fit_ego_lane(line_at(1.8), line_at(-1.8), CAMERA, CameraErrors())
+    assert fit is not None
+    for bottom, told in ((700.0, True), (720.0, False)):
+        near = Boxes(
+            np.array([[540.0, bottom - 200, 740.0, bottom]], np.float32),
+            np.full(1, 0.9, np.float32),
+            np.zeros(1, np.int64),
+        )
+        assert (find_lead(near, fit, CAMERA, CameraErrors()) is not None) == told
+        assert (find_distances(near, CAMERA, CameraErrors())[0] is not None) == told
+
+
+def test_lines_too_far_apart_or_too_near_are_no_lane() -> None:
+    for half, found in ((0.75, False), (1.5, True), (4.0, False)):
+        fit = fit_ego_lane(line_at(half), line_at(-half), CAMERA, CameraErrors())
+        assert (fit is not None) == found
+
+
+def standing(*places: tuple[float, float]) -> Boxes:
+    """Return boxes 1.8 m wide whose feet are so many metres ahead and to the left."""
+    rows = []
+    for ahead, left in places:
+        (u, v), (side, _) = CAMERA.to_pixels(np.array([[ahead, left], [ahead, left + 0.9]])) + 0.5
+        rows.append([side, v - 1.5 * (u - side), 2 * u - side, v])
+    count = len(places)
+    return Boxes(np.array(rows, np.float32), np.full(count, 0.9, np.float32), np.zeros(count, np.int64))
+
+
+def test_the_lead_is_the_nearest_in_the_lane_and_its_distance_that_of_its_rear() -> None:
+    fit = fit_ego_lane(line_at(1.8), line_at(-1.8), CAMERA, CameraErrors())
+    assert fit is not None
+    for places in ([(15.0, 0.0), (25.0, 0.0), (10.0, 3.6)], [(25.0, 0.0), (15.0, 0.0), (10.0, 3.6)]):
+        boxes = standing(*places)
+        lead = find_lead(boxes, fit, CAMERA, CameraErrors())
+        assert lead is not None
+        assert places[lead.box] == (15.0, 0.0)
+        found = [one.value for one in find_distances(boxes, CAMERA, CameraErrors()) if one is not None]
+        assert found == pytest.approx([ahead - REAR_OVERHANG for ahead, _ in places], abs=0.1)
+        assert lead.distance.value == pytest.approx(15.0 - REAR_OVERHANG, abs=0.1)
+
+
+def test_a_lorry_beside_that_the_edge_of_the_picture_cuts_is_no_lead() -> None:
+    fit = fit_ego_lane(line_at(1.8), line_at(-1.8), CAMERA, CameraErrors())
+    assert fit is not None
+    foot = float(CAMERA.to_pixels(np.array([[4.0, 0.0]]))[0, 1])
+    for right, leads in ((620.0, False), (1000.0, True)):
+        cut = Boxes(
+            np.array([[0.0, 300.0, right, foot]], np.float32), np.full(1, 0.9, np.float32), np.zeros(1, np.int64)
+        )
+        assert (find_lead(cut, fit, CAMERA, CameraErrors()) is not None) == leads
+
+
+@pytest.mark.parametrize(("track", "pause"), [(4, 0.05), (3, LeadFilter.GAP + 0.1)])
+def test_another_lead_or_one_that_was_gone_has_no_speed_yet(track: int, pause: float) -> None:
+    leads, boxes = LeadFilter(), standing((30.0, 0.0))
+    found = None
+    for frame in range(20):
+        found = leads.update(LeadVehicle(0, 3, Estimate(30 - 0.1 * frame, 0.5)), boxes, frame * 0.05, CAMERA)
+    assert found is not None
+    assert found.closing_speed is not None
+    assert found.closing_speed.value == pytest.approx(2.0, abs=0.3)
+    found = leads.update(LeadVehicle(0, track, Estimate(20.0, 0.5)), boxes, 0.95 + pause, CAMERA)
+    assert found is not None
+    assert found.distance.value == pytest.approx(20.0)
+    assert found.closing_speed is None

@@ -122,3 +122,23 @@ def test_an_event_as_json() -> None:
 def test_thresholds_must_leave_room_for_hysteresis() -> None:
     with pytest.raises(ConfigError, match="below"):
         EventThresholds(collision_begin=3.0, collision_end=2.0)
+
+
+def test_a_departure_ends_in_the_next_lane_however_narrow() -> None:
+    def narrow(offset: float) -> Road:
+        return Road(ego_lane=EgoLane(Estimate(2.2, 0.1), Estimate(offset, 0.05), Estimate(0.02, 0.002), None))
+
+    events = run(EventDetector(), [narrow(0.15)] * 10 + [narrow(-0.05)] * 30)
+    assert [event.phase for event in events] == ["begin", "end"]
+
+
+def test_a_beginning_must_hold_without_a_gap() -> None:
+    detector = EventDetector()
+    assert not run(detector, [road(time=2.0)] * 2 + [Road()] * 10 + [road(time=2.0)] * 2)
+    assert len(run(detector, [road(time=2.0)] * 5, start=1.0)) == 1
+
+
+def test_a_warning_ends_with_the_vehicle_that_it_began_with() -> None:
+    other = Road(lead=LeadVehicle(0, 9, Estimate(20.0, 1.0), Estimate(4.0, 0.5), Estimate(5.0, 0.3)))
+    events = run(EventDetector(), [road(time=2.0)] * 10 + [other] * 20)
+    assert [(event.phase, event.track_id) for event in events] == [("begin", 7), ("end", 7)]

@@ -158,3 +158,17 @@ def test_positions_count_from_the_vehicle_outwards() -> None:
     (line,) = find_lines(paint(straight(120, 300)))
     numbered = assign_positions([line] * 5, [5.0, -1.0, 1.0, -4.0, None])
     assert [item.position for item in numbered] == [-2, -1, 1, 2, 0]
+
+
+def test_a_line_in_a_large_mask_is_where_its_pixels_are() -> None:
+    mask = np.zeros((720, 1280), np.uint8)
+    mask[360:, 600:608] = 1
+    (line,) = find_lines(mask)
+    assert float(line.column(500.0)) == pytest.approx(603.5, abs=0.2)
+
+
+def test_a_stripe_that_the_edge_of_the_picture_cuts_is_no_line() -> None:
+    mask = np.zeros((360, 640), np.uint8)
+    mask[180:, :6] = mask[180:, 320:326] = 1
+    (line,) = find_lines(mask)
+    assert float(line.column(300.0)) == pytest.approx(322.5, abs=0.2)

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from importlib import resources
 
+import cv2
 import jsonschema
 import numpy as np
 import pytest
@@ -194,3 +195,28 @@ def test_with_tracks_the_lead_keeps_its_number(drive: tuple[Scene, ...], perceiv
         if road.lead is not None and scene.truth.lead is not None:
             tracks.append((road.lead.track_id, scene.truth.lead.number))
     assert len(set(tracks[4:])) == 1
+
+
+def test_with_one_line_in_sight_the_lane_has_the_width_from_before() -> None:
+    camera = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03)
+    ahead = np.linspace(4.5, 60.0, 200)
+
+    def picture(*sides: float) -> Perception:
+        mask = np.zeros(camera.size, np.uint8)
+        for side in sides:
+            pixels = camera.to_pixels(np.stack([ahead, np.full_like(ahead, side)], axis=1))
+            cv2.polylines(mask, [np.round(pixels).astype(np.int32)], False, 1, 3)
+        return Perception(camera.size, lane=mask > 0)
+
+    monitor = RoadMonitor(camera)
+    for _ in range(5):
+        monitor(picture(1.8, -1.8))
+    lane = monitor(picture(1.8)).ego_lane
+    assert lane is not None
+    assert lane.width is not None
+    assert lane.width.value == pytest.approx(3.6, abs=0.15)
+    for frame in range(60):  # the vehicle moves 0.3 m towards the line that is seen
+        lane = monitor(picture(1.8 - min(frame, 30) * 0.01)).ego_lane
+    assert lane is not None
+    assert lane.offset is not None
+    assert lane.offset.value == pytest.approx(0.3, abs=0.1)

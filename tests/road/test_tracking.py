@@ -131,3 +131,32 @@ def test_steady_leaves_absent_tasks_absent() -> None:
     perception = Steady(smoothing=0.5)(Perception((4, 6)))
     assert perception.boxes is None
     assert perception.drivable is None
+
+
+def test_flicker_is_a_share_of_the_mask_before() -> None:
+    full, half = np.ones((4, 4), np.bool_), np.eye(4, dtype=np.bool_)
+    assert flicker([full, half]) == 12 / 16
+    assert flicker([half, full, full]) == 12 / 20
+
+
+def test_two_lines_never_share_an_identity() -> None:
+    tracker = LineTracker((360, 640))
+    (first,) = tracker.update([_line(100)])
+    both = tracker.update([_line(110), _line(96)])  # the second is the nearer
+    assert both[1].id == first.id
+    assert both[0].id != first.id
+
+
+def test_frames_without_time_stamps_are_a_thirtieth_of_a_second_apart() -> None:
+    pytest.importorskip("edgefirst.tracker")
+    steady = Steady(track=True)
+    seen = [*[boxes(100.0)] * 8, *[Boxes.empty()] * 60, *[boxes(100.0)] * 8]  # gone for two seconds
+    numbers = []
+    for found in seen:
+        tracked = steady(Perception((360, 640), boxes=found)).boxes
+        assert tracked is not None
+        assert tracked.track_id is not None
+        numbers.append(tracked.track_id.tolist())
+    assert numbers[7] != [-1]
+    assert numbers[-1] != [-1]
+    assert numbers[7] != numbers[-1]

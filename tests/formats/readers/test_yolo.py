@@ -142,3 +142,8 @@ def test_lists_of_images(root: Path) -> None:
     source = read_yolo(root)
     assert source.names("train") == ["a", "b c"]
     assert source.found == ("train: 2 images", "train: 1 listed images are not there")
+
+
+def test_the_validation_split_may_be_called_valid(root: Path) -> None:
+    (root / "data.yaml").write_text("path: .\ntrain: images/train\nvalid: images/val\nnames: [car]\n")
+    assert read_yolo(root).splits == ("train", "val")

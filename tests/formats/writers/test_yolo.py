@@ -60,3 +60,11 @@ def test_what_was_not_looked_for_leaves_no_labels(tmp_path: Path, pictures: list
     with YoloWriter(tmp_path) as writer:
         writer.write(dataclasses.replace(pictures[0], boxes=None))
     assert list(tmp_path.rglob("*.*")) == writer.files == []
+
+
+def test_the_confidence_is_written_only_where_it_is_asked_for(tmp_path: Path, pictures: list[Perception]) -> None:
+    for name, confidence, columns in (("labels-alone", False, 5), ("with-confidence", True, 6)):
+        with YoloWriter(tmp_path / name, confidence=confidence) as writer:
+            writer.write(pictures[0])
+        lines = (tmp_path / name / "labels" / "road.txt").read_text().splitlines()
+        assert {len(line.split()) for line in lines} == {columns}

@@ -1,0 +1,28 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from trilitenet.errors import ShapeError
+from trilitenet.structures import Boxes, Perception
+
+
+def boxes(*class_id: int) -> Boxes:
+    count = len(class_id)
+    corners = np.arange(4 * count, dtype=np.float32).reshape(-1, 4)
+    return Boxes(corners, np.full(count, 0.5, np.float32), np.array(class_id), 10 + np.arange(count))
+
+
+def test_selected_boxes_keep_all_that_is_known_of_them() -> None:
+    for index in (np.array([False, True, True]), np.array([1, 2])):
+        chosen = boxes(0, 1, 0).select(index)
+        assert chosen.xyxy[:, 0].tolist() == [4, 8]
+        assert chosen.class_id.tolist() == [1, 0]
+        assert chosen.track_id is not None
+        assert chosen.track_id.tolist() == [11, 12]
+
+
+@pytest.mark.parametrize("class_id", [-1, 2])
+def test_a_class_without_a_name_is_refused(class_id: int) -> None:
+    with pytest.raises(ShapeError, match=f"class id {class_id} has no name"):
+        Perception((10, 10), ("car", "bus"), boxes(0, class_id, 1))
