@@ -475,16 +475,16 @@ class LeadFilter:
         noise = pixel * (lead.distance.value**2 + camera.height**2) / (camera.fy * camera.height)
         step = timestamp - self._last
         same = self._state is not None and -LATE <= step <= self.GAP and self._is_same(lead, box)
-        if -LATE <= step < 0 and self._state is not None:
-            if not same:
-                return lead
-        else:
-            if same:
-                self._advance(step, lead.distance.value, noise)
-            else:
-                self._state = np.array([lead.distance.value, 0.0])
-                self._covariance = np.diag([noise**2, 15.0**2])
-                self._since = timestamp
+        late = self._state is not None and -LATE <= step < 0
+        if late and not same:
+            return lead
+        if same and not late:
+            self._advance(step, lead.distance.value, noise)
+        elif not same:
+            self._state = np.array([lead.distance.value, 0.0])
+            self._covariance = np.diag([noise**2, 15.0**2])
+            self._since = timestamp
+        if not late:
             self._last, self._identity, self._box = timestamp, lead.track_id, box
         assert self._state is not None
         distance, rate = self._state.tolist()
