@@ -278,6 +278,15 @@ def test_splits_without_images_are_left_out(tmp_path: Path) -> None:
     assert report.dropped["test"] == {"image: labels or image broken": 1}
 
 
+@pytest.mark.parametrize("split", ["../../evil", "/evil", "a/b", "..", ".", "", "a\0b"])
+def test_a_split_that_is_no_folder_name_is_refused(tmp_path: Path, split: str) -> None:
+    source = Records(train=[picture(tmp_path / "raw/a.png")], **{split: [picture(tmp_path / "raw/b.png")]})
+    before = tree(tmp_path)
+    with pytest.raises(DataError, match="is not the name of one folder; rename it"):
+        convert(source, tmp_path / "some/where/out")
+    assert tree(tmp_path) == before
+
+
 def test_attributes_leave_the_columns_of_the_index_alone(tmp_path: Path) -> None:
     record = picture(tmp_path / "raw/a.png", attributes={"name": "Ann", "split": "left", "weather": "rainy"})
     convert(Records(train=[record]), tmp_path / "out")

@@ -164,7 +164,7 @@ def convert(
     Raises:
         OutputError: If ``out`` holds something else, or a conversion with other options or of another source; or if it
             cannot be written.
-        DataError: If a split is unknown.
+        DataError: If a split is unknown, or its name not that of one folder.
     """
     options = options or ConversionOptions()
     root = Path(out)
@@ -172,6 +172,9 @@ def convert(
     unknown = [split for split in chosen if split not in source.splits]
     if unknown:
         raise DataError(f"no split {unknown[0]!r}; there are {', '.join(source.splits)}")
+    for split in chosen:
+        if Path(split).name != split or split in {"", ".", ".."} or "\0" in split:
+            raise DataError(f"split {split!r} is not the name of one folder; rename it where the source names it")
     state = _open_state(root, options, source.origin)
     names = {split: source.names(split) for split in chosen}
     if splits is None:
