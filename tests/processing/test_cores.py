@@ -47,6 +47,15 @@ def test_ctrl_c_in_the_terminal_ends_all_processes_without_a_word(when: str) -> 
     assert time.monotonic() - began < 50
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal")
+def test_processes_end_when_the_one_that_started_them_is_killed() -> None:
+    with subprocess.Popen([sys.executable, "-c", SCRIPT, "busy"], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "begun\n"
+        process.kill()
+        assert process.communicate(timeout=30)[0] == ""  # which waits for all that hold the pipe
+
+
 def test_a_pool_works_and_tells_errors() -> None:
     with ProcessPool(2) as pool:
         assert list(pool.map(abs, [-1, 2, -3])) == [1, 2, 3]

@@ -7,6 +7,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
 from typing import Any, TypeVar
@@ -24,7 +25,8 @@ def usable_cores() -> int:
 class ProcessPool(concurrent.futures.ProcessPoolExecutor):
     """Processes that Ctrl-C in the terminal, which reaches all of them, ends without a word.
 
-    What a process is at is interrupted, so that it cleans up; what waits is forgotten.
+    What a process is at is interrupted, so that it cleans up; what waits is forgotten. Processes whose own was killed
+    end, too.
 
     Args:
         workers: How many.
@@ -71,11 +73,20 @@ _busy = _stopped = False
 
 
 def _begin(heeds: bool, initializer: Callable[..., object] | None, initargs: tuple[Any, ...]) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()  # while it takes no signal from the main thread
     signal.signal(signal.SIGINT, _stop if heeds else signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     if initializer is not None:
         initializer(*initargs)
+
+
+def _end_with_parent() -> None:
+    """End this process when the one that started it has gone, which cannot ask for it when it is killed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
