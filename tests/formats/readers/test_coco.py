@@ -176,6 +176,22 @@ def test_labels_made_at_another_size_are_left_out(tmp_path: Path) -> None:
     assert report.dropped["train"] == {"image: labels or image broken": 1}
 
 
+def test_annotations_of_no_image_are_counted(tmp_path: Path) -> None:
+    write(tmp_path / "one.png")
+    annotations = [{**item, "image_id": image} for item, image in zip(coco()["annotations"], (7, 8, "7"), strict=False)]
+    write(tmp_path / "labels.json", coco(annotations=annotations))
+    source = read_coco(tmp_path)
+    assert len(source.record("train", "one").objects or ()) == 1
+    assert source.found[-1] == "train: 2 annotations of labels.json left out: their image_id is no image's id"
+
+
+def test_annotations_that_are_all_of_no_image_are_refused(tmp_path: Path) -> None:
+    write(tmp_path / "one.png")
+    write(tmp_path / "labels.json", coco(annotations=[{**item, "image_id": "7"} for item in coco()["annotations"]]))
+    with pytest.raises(DataError, match=r"no annotation has the id of an image \(image_id '7', but images 7, \.\.\.\)"):
+        read_coco(tmp_path)
+
+
 def test_a_split_without_images_is_left_out(tmp_path: Path) -> None:
     write(tmp_path / "train/one.png")
     for split in ("train", "val"):

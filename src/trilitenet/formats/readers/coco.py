@@ -29,7 +29,7 @@ def read_coco(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
         mapping: What the categories mean.
 
     Raises:
-        DataError: If there is no annotation file, or a broken one.
+        DataError: If there is no annotation file, or a broken one, or one whose annotations are of no image in it.
     """
     mapping = mapping or LabelMapping()
     root = Path(root)
@@ -40,9 +40,11 @@ def read_coco(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
         folders.append(folders[0].resolve().parent)
     chosen, unused = _annotation_files(root, mapping.split)
     for path, split, content in chosen:
-        items, missing = _read_file(content, path, split, folders, mapping)
+        items, missing, stray = _read_file(content, path, split, folders, mapping)
         records[split] += items
         found.append(f"{split}: {len(items)} images of {path.name}; {missing} more are not there")
+        if stray:
+            found.append(f"{split}: {stray} annotations of {path.name} left out: their image_id is no image's id")
     if not any(records.values()):
         raise DataError(f"{root}: none of the images of its annotation files is there")
     if unused:
@@ -92,12 +94,20 @@ def _split_of(path: Path, default: str) -> str:
 
 def _read_file(
     content: Any, path: Path, split: str, roots: list[Path], mapping: LabelMapping
-) -> tuple[list[ImageRecord], int]:
+) -> tuple[list[ImageRecord], int, int]:
+    """Return the images, how many more are not there, and how many annotations are of no image that is listed."""
     try:
         names = {item["id"]: str(item["name"]) for item in content.get("categories", ())}
         labels: dict[Any, list[dict[str, Any]]] = defaultdict(list)
         for item in content["annotations"]:
             labels[item["image_id"]].append(item)
+        stray = labels.keys() - {image["id"] for image in content["images"]}
+        strays = sum(len(labels[number]) for number in stray)
+        if content["images"] and stray and stray == labels.keys():
+            raise DataError(
+                f"{path}: no annotation has the id of an image (image_id {min(map(repr, stray))}, but images "
+                f"{content['images'][0]['id']!r}, ...); write both alike, as numbers or as text"
+            )
         tasks = mapping.labelled(set(names.values()))
         folders = [path.parent]
         for root in roots:
@@ -125,9 +135,11 @@ def _read_file(
                     size=size if all(size) else None,
                 )
             )
+    except DataError:
+        raise
     except (LookupError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise DataError(f"{path}: not as COCO has it ({brief(error)})") from error
-    return records, missing
+    return records, missing, strays
 
 
 def _read_labels(
