@@ -105,6 +105,20 @@ def test_a_report_is_whole_or_not_there(published: Path, tmp_path: Path, monkeyp
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 
+def test_a_conversion_without_images_or_labels_is_an_error(
+    raw: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.rmtree(raw / "labels")
+    assert main(["data", "convert", "bdd100k", str(raw), str(tmp_path / "one"), "--workers", "1"]) == 1
+    assert re.search(r"error: .*one: no image is labelled; .* --classes FILE", capsys.readouterr().err)
+    for image in raw.rglob("*.jpg"):
+        image.write_bytes(b"")
+    assert main(["data", "convert", "bdd100k", str(raw), str(tmp_path / "two"), "--workers", "1"]) == 1
+    shown = capsys.readouterr()
+    assert "train: left out 2 x image: labels or image broken" in shown.out
+    assert "two: no image was written" in shown.err
+
+
 def test_convert_wants_its_words(raw: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="unknown kind of data set 'kitti'"):
         convert("kitti", raw, tmp_path / "out")

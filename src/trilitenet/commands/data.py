@@ -58,6 +58,23 @@ class Converted:
     found: tuple[str, ...]
     report: ConversionReport
 
+    @property
+    def errors(self) -> tuple[str, ...]:
+        """Why the data set is of no use, in a line; none if it has a label."""
+        if not any(self.report.images.values()):
+            return (f"{self.output}: no image was written; see above what was found and why it was left out",)
+        if not any(self.report.labelled.values()):
+            return (
+                f"{self.output}: no image is labelled; see above what was found, "
+                "and say what names and values mean with --classes FILE (docs/data.md)",
+            )
+        return ()
+
+    @property
+    def exit_code(self) -> int:
+        """1 if there is no image, or none with a label."""
+        return int(bool(self.errors))
+
     def summary(self) -> str:
         """Return what was found, written and left out, for people."""
         table = Table("split", "images", "detection", "drivable", "lane", "boxes", "markings")
@@ -99,7 +116,8 @@ def convert(
     """Convert a foreign data set to the published layout.
 
     ``trilitenet data convert bdd100k RAW OUT`` and ``trilitenet data convert --from coco DIR OUT`` are the two ways to
-    say it. A conversion that was interrupted goes on where it stood; run again, it changes nothing.
+    say it. A conversion that was interrupted goes on where it stood; run again, it changes nothing. Exits 1 when no
+    image was written, or none with a label.
 
     Args:
         source: What it is (bdd100k, coco, yolo, cvat, masks), or with --from the folder or annotation file itself.

@@ -212,3 +212,15 @@ def test_a_conversion_keeps_to_its_source_and_mapping(tmp_path: Path) -> None:
     for source in (read_coco(tmp_path / "b"), read_coco(tmp_path / "a", LabelMapping(drivable=("road",)))):
         with pytest.raises(OutputError, match="another source"):
             convert(source, tmp_path / "out")
+
+
+def test_categories_that_all_mean_nothing_are_refused(tmp_path: Path) -> None:
+    write(tmp_path / "one.png")
+    write(tmp_path / "labels.json", coco(categories=[{"id": 1, "name": "Car"}, {"id": 2, "name": "Road"}]))
+    with pytest.raises(DataError, match=r"none of its categories \('Car', 'Road'\) .* --classes FILE"):
+        read_coco(tmp_path)
+    assert read_coco(tmp_path, LabelMapping(lane=("Road",))).names("train") == ["one"]
+    write(tmp_path / "two.png")
+    more = coco(images=[{**coco()["images"][0], "file_name": "two.png"}])
+    write(tmp_path / "more.json", more)
+    assert read_coco(tmp_path).record("train", "one").objects is None  # one file of two says what is looked for

@@ -155,3 +155,11 @@ def test_labels_made_at_another_size_are_left_out(tmp_path: Path, size: str, ima
 def test_points_are_pairs(tmp_path: Path, points: str) -> None:
     with pytest.raises(DataError, match="not as CVAT has it"):
         read_shapes(tmp_path, f'<polygon label="car" points="{points}"></polygon>', LabelMapping())
+
+
+def test_labels_that_all_mean_nothing_are_refused(tmp_path: Path) -> None:
+    box = '<box label="{}" xtl="1" ytl="2" xbr="9" ybr="7"></box>'
+    with pytest.raises(DataError, match=r"none of its categories \('Car'\) .* --classes FILE"):
+        read_shapes(tmp_path, box.format("Car"), LabelMapping())
+    assert read_shapes(tmp_path, box.format("Car") + box.format("car"), LabelMapping()).objects
+    assert read_shapes(tmp_path, "", LabelMapping()).objects is None

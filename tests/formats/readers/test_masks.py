@@ -11,7 +11,7 @@ from tests.formats.readers.conftest import SIZE
 from trilitenet.data.converting import convert
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.errors import ConfigError, DataError
-from trilitenet.formats.readers.mapping import MaskRule, parse_colour, read_mapping
+from trilitenet.formats.readers.mapping import LabelMapping, MaskRule, parse_colour, read_mapping
 from trilitenet.formats.readers.masks import read_masks
 
 YAML = """
@@ -136,3 +136,11 @@ def test_a_place_in_braces_that_is_not_known_is_named(tmp_path: Path, mapping: d
     path.write_text(yaml.safe_dump(mapping))
     with pytest.raises(ConfigError, match=r"may hold \{split\}"):
         read_mapping(path)
+
+
+def test_images_without_any_mask_are_refused(root: Path) -> None:
+    mapping = LabelMapping(images="frames/{split}")
+    with pytest.raises(
+        DataError, match=r"no mask of any image at drivable/\{split\}/\{name\}\.png or lane/.*--classes"
+    ):
+        read_masks(root, mapping)

@@ -147,3 +147,10 @@ def test_lists_of_images(root: Path) -> None:
 def test_the_validation_split_may_be_called_valid(root: Path) -> None:
     (root / "data.yaml").write_text("path: .\ntrain: images/train\nvalid: images/val\nnames: [car]\n")
     assert read_yolo(root).splits == ("train", "val")
+
+
+def test_class_names_that_all_mean_nothing_are_refused(root: Path) -> None:
+    (root / "data.yaml").write_text("train: images/train\nnames: {0: Car}\n")
+    with pytest.raises(DataError, match=r"none of its categories \('Car'\) .* --classes FILE"):
+        read_yolo(root)
+    assert read_yolo(root, LabelMapping(tasks=("detection",))).names("train") == ["a"]

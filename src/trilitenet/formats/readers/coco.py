@@ -29,24 +29,27 @@ def read_coco(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
         mapping: What the categories mean.
 
     Raises:
-        DataError: If there is no annotation file, or a broken one, or one whose annotations are of no image in it.
+        DataError: If there is no annotation file, or a broken one, or one whose annotations are of no image in it; or
+            if the categories mean nothing.
     """
     mapping = mapping or LabelMapping()
     root = Path(root)
     records: dict[str, list[ImageRecord]] = defaultdict(list)
     found = []
+    categories: set[str] = set()
     folders = [root if root.is_dir() else root.parent]
     if root.is_file() and folders[0].resolve().name == "annotations":
         folders.append(folders[0].resolve().parent)
     chosen, unused = _annotation_files(root, mapping.split)
     for path, split, content in chosen:
-        items, missing, stray = _read_file(content, path, split, folders, mapping)
+        items, missing, stray = _read_file(content, path, split, folders, mapping, categories)
         records[split] += items
         found.append(f"{split}: {len(items)} images of {path.name}; {missing} more are not there")
         if stray:
             found.append(f"{split}: {stray} annotations of {path.name} left out: their image_id is no image's id")
     if not any(records.values()):
         raise DataError(f"{root}: none of the images of its annotation files is there")
+    mapping.check_categories(categories, root)
     if unused:
         found.append(f"not used: {', '.join(path.name for path in unused)}")
     splits = {split: items for split, items in records.items() if items}
@@ -93,9 +96,12 @@ def _split_of(path: Path, default: str) -> str:
 
 
 def _read_file(
-    content: Any, path: Path, split: str, roots: list[Path], mapping: LabelMapping
+    content: Any, path: Path, split: str, roots: list[Path], mapping: LabelMapping, categories: set[str]
 ) -> tuple[list[ImageRecord], int, int]:
-    """Return the images, how many more are not there, and how many annotations are of no image that is listed."""
+    """Return the images, how many more are not there, and how many annotations are of no image that is listed.
+
+    What its categories are called is added to ``categories``.
+    """
     try:
         names = {item["id"]: str(item["name"]) for item in content.get("categories", ())}
         labels: dict[Any, list[dict[str, Any]]] = defaultdict(list)
@@ -109,6 +115,7 @@ def _read_file(
                 f"{content['images'][0]['id']!r}, ...); write both alike, as numbers or as text"
             )
         tasks = mapping.labelled(set(names.values()))
+        categories.update(names.values())
         folders = [path.parent]
         for root in roots:
             folders += [root, root / "images"]

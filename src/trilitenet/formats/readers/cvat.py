@@ -35,7 +35,7 @@ def read_cvat(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
         mapping: What the labels mean.
 
     Raises:
-        DataError: If there is no such file, a broken one, or one of videos.
+        DataError: If there is no such file, a broken one, or one of videos; or if the labels mean nothing.
     """
     mapping = mapping or LabelMapping()
     root = Path(root)
@@ -44,16 +44,18 @@ def read_cvat(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
         raise DataError(f"{root}: no .xml file; export the task from CVAT as 'CVAT for images 1.1'")
     folder = root.parent if root.is_file() else root
     records: dict[str, list[ImageRecord]] = defaultdict(list)
+    categories: set[str] = set()
     missing = videos = 0
     for path in files:
         try:
-            missing += _read_file(path, folder, mapping, records)
+            missing += _read_file(path, folder, mapping, records, categories)
         except _OfVideoError:
             videos += 1
             if videos == len(files):
                 raise
     if not any(records.values()):
         raise DataError(f"{root}: none of the images that the .xml lists is there; put them beside it or in images/")
+    mapping.check_categories(categories, root)
     found = [f"{split}: {len(items)} images" for split, items in records.items()]
     if missing:
         found.append(f"{missing} listed images are not there")
@@ -62,7 +64,10 @@ def read_cvat(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
     return ListedRecords(records, tuple(found), mapping.origin("cvat", root))
 
 
-def _read_file(path: Path, folder: Path, mapping: LabelMapping, records: dict[str, list[ImageRecord]]) -> int:
+def _read_file(
+    path: Path, folder: Path, mapping: LabelMapping, records: dict[str, list[ImageRecord]], every: set[str]
+) -> int:
+    """Add a file's images to ``records`` and its labels' names to ``every``; return how many images are not there."""
     categories: set[str] = set()
     images: list[ElementTree.Element] = []
     try:
@@ -80,6 +85,7 @@ def _read_file(path: Path, folder: Path, mapping: LabelMapping, records: dict[st
         raise DataError(f"{path}: not XML ({error})") from error
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    every |= categories
     tasks = mapping.labelled(categories)
     missing = 0
     for element in images:

@@ -27,6 +27,7 @@ SPLIT_NAMES: Final = {
     "test": "test",
 }
 """What foreign formats call a split -> what it is called here."""
+_MOST_NAMED: Final = 10
 _KINDS: Final = ("direct", "alternative", "foreground", "ignore", "background")
 
 
@@ -137,6 +138,20 @@ class LabelMapping:
         if categories & set(self.lane):
             tasks.add("lane")
         return tasks
+
+    def check_categories(self, categories: set[str], root: Path) -> None:
+        """Refuse a data set whose categories all mean nothing, of which no label would be left.
+
+        Raises:
+            DataError: If there are some, and none is in a class, an area or a marking.
+        """
+        names = sorted(categories - {""})
+        if names and not self.labelled(categories):
+            some = ", ".join(map(repr, names[:_MOST_NAMED])) + (", ..." if len(names) > _MOST_NAMED else "")
+            raise DataError(
+                f"{root}: none of its categories ({some}) is one of a class, of areas or of lane markings; "
+                "say what they mean with --classes FILE (docs/data.md)"
+            )
 
 
 @dataclasses.dataclass

@@ -21,7 +21,7 @@ def read_masks(root: str | Path, mapping: LabelMapping | None = None) -> ListedR
         mapping: Where images and masks are, and what the values mean; see `MaskRule`.
 
     Raises:
-        DataError: If there are no images.
+        DataError: If there are no images, or no mask of any.
         ConfigError: If the values are wrong.
     """
     mapping = mapping or LabelMapping()
@@ -51,6 +51,11 @@ def read_masks(root: str | Path, mapping: LabelMapping | None = None) -> ListedR
             found.append(f"{split}: {len(items)} images, {drivable} drivable masks, {lane} lane masks")
     if not records:
         raise DataError(f"{root}: no images in {mapping.images!r} for the splits {', '.join(mapping.splits)}")
+    if all(item.drivable is None and item.lane is None for items in records.values() for item in items):
+        places = [getattr(mapping, f"{task}_mask").path for task in ("drivable", "lane") if task in tasks]
+        raise DataError(
+            f"{root}: no mask of any image at {' or '.join(places)}; say where they are with --classes FILE"
+        )
     return ListedRecords(records, tuple(found), mapping.origin("masks", root))
 
 

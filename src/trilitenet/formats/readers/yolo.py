@@ -119,7 +119,7 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
         mapping: What the class names mean.
 
     Raises:
-        DataError: If there is no such file, or no images where it says.
+        DataError: If there is no such file, or no images where it says; or if the class names mean nothing.
     """
     mapping = mapping or LabelMapping()
     path = _find_yaml(Path(root))
@@ -150,9 +150,11 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
     images = {split: items for split, items in images.items() if items}
     if not images:
         raise DataError(f"{path}: no images in the folders that it names")
+    table = {key: str(value) for key, value in table.items()}
+    mapping.check_categories(set(table.values()), path)
     found = [f"{split}: {len(items)} images" for split, items in images.items()]
     found += [f"{split}: {count} listed images are not there" for split, count in missing.items()]
-    return YoloSource(path, dict(images), {key: str(value) for key, value in table.items()}, mapping, tuple(found))
+    return YoloSource(path, dict(images), table, mapping, tuple(found))
 
 
 def _find_yaml(root: Path) -> Path:
