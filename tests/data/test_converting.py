@@ -13,6 +13,9 @@ from PIL import Image
 
 from tests.formats.readers import raw_bdd
 from trilitenet.data.converting import ConversionOptions, convert, lane_mask
+
+
+from trilitenet.data.converting import ConversionOptions, convert, drivable_mask
 from trilitenet.data.description import read_description
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.records import AreaLabel, CocoRuns, ImageRecord, LaneLabel, MaskFile, ObjectLabel, RowRuns
@@ -376,3 +379,12 @@ def test_an_interrupted_copy_of_an_image_is_not_taken_for_it(
     with pytest.raises(KeyboardInterrupt):
         convert(read_bdd100k(raw), tmp_path / "out", ConversionOptions(images="copy"))
     assert not list((tmp_path / "out" / "images").rglob("[!.]*.jpg"))
+
+
+def test_ignored_areas_are_drawn_over_all() -> None:
+    """In the order of a file of COCO there is no meaning."""
+    ignored = AreaLabel("ignore", np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 6.0], [0.0, 6.0]]))
+    road = AreaLabel("direct", np.array([[0.0, 0.0], [8.0, 0.0], [8.0, 6.0], [0.0, 6.0]]))
+    other = dataclasses.replace(road, kind="alternative", points=np.add(road.points, (4.0, 0.0)))
+    mask = drivable_mask([ignored, road, other], (6, 8), keep_alternative=True)
+    assert mask.tolist() == [[64] * 2 + [255] * 2 + [127] * 4] * 6

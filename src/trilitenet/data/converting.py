@@ -230,7 +230,7 @@ def _convert_split(
 def drivable_mask(
     areas: Iterable[AreaLabel | RunLabel], size: tuple[int, int], *, keep_alternative: bool = False
 ) -> NDArray[np.uint8]:
-    """Draw drivable areas, later ones over earlier ones.
+    """Draw drivable areas, later ones over earlier ones, and what is to be ignored over all.
 
     Args:
         areas: Polygons in pixels.
@@ -238,10 +238,10 @@ def drivable_mask(
         keep_alternative: Draw alternative areas with 127 instead of 255.
 
     Returns:
-        (height, width) uint8: 255 direct, 255 or 127 alternative, 0 elsewhere.
+        (height, width) uint8: 255 direct, 255 or 127 alternative, 64 ignored, 0 elsewhere.
     """
     mask = np.zeros(size, np.uint8)
-    for area in areas:
+    for area in sorted(areas, key=lambda area: area.kind == "ignore"):
         level = _level(area.kind, keep_alternative=keep_alternative)
         if isinstance(area, AreaLabel):
             fill_polygon(mask, area.points, level)
