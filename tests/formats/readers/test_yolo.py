@@ -93,7 +93,10 @@ def test_errors(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"no data\.yaml"):
         read_yolo(tmp_path)
     (tmp_path / "data.yaml").write_text("names: [car]\ntrain: images/train\n")
-    with pytest.raises(DataError, match="no images"):
+    with pytest.raises(DataError, match=rf"no images; looked in {tmp_path}/images/train$"):
+        read_yolo(tmp_path)
+    (tmp_path / "data.yaml").write_text("names: [car]\n")
+    with pytest.raises(DataError, match="it names no folder as train, val or test"):
         read_yolo(tmp_path)
     (tmp_path / "data.yaml").write_bytes("names: [K\u00e4fer]".encode("latin-1"))
     with pytest.raises(DataError, match=r"data\.yaml: not text in UTF-8"):
@@ -133,6 +136,17 @@ def test_boxes_are_parts_of_the_turned_image(root: Path, turn: int, box: tuple[f
     record = read_yolo(root).record("train", "a")
     assert record.objects is not None
     assert record.objects[0].box == box
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_folders_as_roboflow_names_them(root: Path, inside: bool) -> None:
+    """Its ``data.yaml`` says ``../train/images``, though ``train`` lies beside the file; what is there wins."""
+    folder = root if inside else root / "yolo"
+    folder.mkdir(exist_ok=True)
+    (root / "images/train").rename(root / "images/images")
+    (root / "images").rename(root / "train")
+    (folder / "data.yaml").write_text("train: ../train/images\nval: ../valid/images\nnames: [car]\n")
+    assert read_yolo(folder).names("train") == ["a"]
 
 
 def test_lists_of_images(root: Path) -> None:

@@ -135,12 +135,15 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
         raise DataError(f"{path}: not a YOLO data file ({brief(error)})") from error
     images: dict[str, dict[str, Path]] = defaultdict(dict)
     missing: Counter[str] = Counter()
+    looked: dict[Path, None] = {}
     for key, split in (("train", "train"), ("val", "val"), ("valid", "val"), ("test", "test")):
         places = content.get(key)
         if not places:
             continue
         for place in places if isinstance(places, list) else [places]:
-            for image in _images_at(base, path.parent, str(place)):
+            candidates = _candidates(base, path.parent, str(place))
+            looked |= dict.fromkeys(root / part for root, part in candidates)
+            for image in _images_at(candidates):
                 if not image.is_file():
                     missing[split] += 1
                 elif images[split].setdefault(image.stem, image) != image:
@@ -149,7 +152,8 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
         images.pop("val", None)
     images = {split: items for split, items in images.items() if items}
     if not images:
-        raise DataError(f"{path}: no images in the folders that it names")
+        words = f"looked in {', '.join(map(str, looked))}" if looked else "it names no folder as train, val or test"
+        raise DataError(f"{path}: no images; {words}")
     table = {key: str(value) for key, value in table.items()}
     mapping.check_categories(set(table.values()), path)
     found = [f"{split}: {len(items)} images" for split, items in images.items()]
@@ -175,10 +179,15 @@ def _read_text(path: Path) -> str:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def _images_at(base: Path, beside: Path, place: str) -> list[Path]:
-    """Return the images in a folder, or those that a list names, whether they are there or not."""
-    for root in (base, beside):
-        folder = root / place
+def _candidates(base: Path, beside: Path, place: str) -> list[tuple[Path, str]]:
+    """Return (folder, place in it) where images may be; Roboflow writes ``../train/images`` of what lies beside."""
+    return [(root, part) for part in (place, place.removeprefix("../")) for root in (base, beside)]
+
+
+def _images_at(candidates: list[tuple[Path, str]]) -> list[Path]:
+    """Return the images in the first folder that is there, or those that a list names, whether they are or not."""
+    for root, part in candidates:
+        folder = root / part
         if folder.is_dir():
             return sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_ENDINGS)
         if folder.suffix == ".txt" and folder.is_file():
