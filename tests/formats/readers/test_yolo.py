@@ -101,6 +101,15 @@ def test_errors(tmp_path: Path) -> None:
     (tmp_path / "data.yaml").write_bytes("names: [K\u00e4fer]".encode("latin-1"))
     with pytest.raises(DataError, match=r"data\.yaml: not text in UTF-8"):
         read_yolo(tmp_path)
+    (tmp_path / "data.yaml").write_text("names: [car\n")
+    with pytest.raises(DataError, match=r"data\.yaml: not YAML \(while parsing a flow sequence"):
+        read_yolo(tmp_path)
+
+
+def test_a_byte_order_mark_is_no_text(root: Path) -> None:
+    for path, text in (("labels/train/a.txt", "0 0.5 0.5 0.5 0.5\n"), ("data.yaml", (root / "data.yaml").read_text())):
+        (root / path).write_text(text, encoding="utf-8-sig")
+    assert len(read_yolo(root).record("train", "a").objects or ()) == 1
 
 
 def test_labels_that_are_not_utf8_or_no_numbers(root: Path) -> None:

@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import yaml
 
-from trilitenet.config import Task
+from trilitenet.config import Task, read_yaml
 from trilitenet.data.reading import IMAGE_ENDINGS
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ObjectLabel, image_size, same_name
-from trilitenet.errors import DataError, brief
+from trilitenet.errors import ConfigError, DataError, brief
 from trilitenet.formats.readers.mapping import LabelMapping, Shapes, hull
 
 __all__ = ["YoloSource", "read_yolo"]
@@ -123,15 +122,17 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
     """
     mapping = mapping or LabelMapping()
     path = _find_yaml(Path(root))
-    text = _read_text(path)
     try:
-        content: Any = yaml.safe_load(text)
-        names = content["names"]
+        content = read_yaml(path)
+    except ConfigError as error:
+        raise DataError(str(error)) from error
+    try:
+        names: Any = content["names"]
         table = dict(enumerate(names)) if isinstance(names, list) else {int(key): value for key, value in names.items()}
         base = path.parent / str(content.get("path") or ".")
         if not base.is_dir():
             base = path.parent
-    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise DataError(f"{path}: not a YOLO data file ({brief(error)})") from error
     images: dict[str, dict[str, Path]] = defaultdict(dict)
     missing: Counter[str] = Counter()
@@ -172,7 +173,7 @@ def _find_yaml(root: Path) -> Path:
 
 def _read_text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # editors put a mark before the first line
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: not text in UTF-8 ({brief(error)}); save it as such") from error
     except OSError as error:
