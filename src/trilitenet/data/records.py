@@ -17,6 +17,7 @@ from trilitenet.processing.serialise import decode_mask
 
 __all__ = [
     "AreaLabel",
+    "BrokenRecord",
     "CocoRuns",
     "ImageRecord",
     "LaneLabel",
@@ -202,6 +203,17 @@ class ImageRecord:
     size: tuple[int, int] | None = None
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class BrokenRecord(ImageRecord):
+    """An image whose labels are broken; a conversion leaves it out.
+
+    Attributes:
+        reason: What is wrong with them.
+    """
+
+    reason: str = ""
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Return an image's (height, width), turned as its EXIF data say, without decoding the pixels.
 
@@ -260,8 +272,15 @@ class ListedRecords:
         return sorted(self._records[split])
 
     def record(self, split: str, name: str) -> ImageRecord:
-        """Return one image's labels."""
-        return self._records[split][name]
+        """Return one image's labels.
+
+        Raises:
+            DataError: If they are broken.
+        """
+        record = self._records[split][name]
+        if isinstance(record, BrokenRecord):
+            raise DataError(record.reason)
+        return record
 
 
 class RecordSource(Protocol):

@@ -103,16 +103,10 @@ def test_errors(tmp_path: Path) -> None:
     path.write_text(json.dumps(coco()))
     with pytest.raises(DataError, match="none of the images"):
         read_coco(path)
-    road = {"image_id": 7, "category_id": 2, "bbox": [0, 0, 1, 1]}
-    for annotation in (
-        {"hello": 1},
-        {**road, "segmentation": {"size": [1], "counts": "0"}},
-        {**road, "segmentation": {"size": [48, float("inf")], "counts": "0"}},
-    ):
-        path.write_text(json.dumps(coco(annotations=[annotation])))
-        cv2.imwrite(str(tmp_path / "one.png"), np.zeros((*SIZE, 3), np.uint8))
-        with pytest.raises(DataError, match="not as COCO has it"):
-            read_coco(path, LabelMapping(drivable=("road",)))
+    path.write_text(json.dumps(coco(annotations=[{"hello": 1}])))
+    cv2.imwrite(str(tmp_path / "one.png"), np.zeros((*SIZE, 3), np.uint8))
+    with pytest.raises(DataError, match="not as COCO has it"):
+        read_coco(path)
 
 
 def write(path: Path, content: dict[str, Any] | None = None) -> None:
@@ -224,3 +218,33 @@ def test_categories_that_all_mean_nothing_are_refused(tmp_path: Path) -> None:
     more = coco(images=[{**coco()["images"][0], "file_name": "two.png"}])
     write(tmp_path / "more.json", more)
     assert read_coco(tmp_path).record("train", "one").objects is None  # one file of two says what is looked for
+
+
+@pytest.mark.parametrize(
+    ("annotation", "message"),
+    [
+        ({"bbox": None}, "bbox must be 4 numbers"),
+        ({"bbox": []}, "bbox must be 4 numbers"),
+        ({}, "bbox must be 4 numbers"),
+        ({"bbox": [1, 2, 3, "x"]}, "bbox must be 4 numbers"),
+        ({"bbox": [1, 2, 3, 4], "category_id": None}, "category_id must be the id of a category"),
+        ({"category_id": 2, "segmentation": [[1, 2, 3]]}, "a polygon must be an even number of coordinates"),
+        ({"category_id": 2, "segmentation": [1, 2, 3, 4, 5, 6]}, "a polygon must be an even number of coordinates"),
+        ({"category_id": 2, "segmentation": {"size": [1], "counts": "0"}}, "run lengths need a size"),
+        ({"category_id": 2, "segmentation": {"size": [48, float("inf")], "counts": "0"}}, "run lengths need a size"),
+        ({"category_id": 2, "segmentation": {"size": [48, 80]}}, "run lengths need a size"),
+        ({"category_id": 2, "segmentation": 1}, "segmentation must be a list of polygons, or run lengths"),
+    ],
+)
+def test_an_image_with_a_broken_annotation_is_left_out_and_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, annotation: dict[str, Any], message: str
+) -> None:
+    for name in ("one", "two"):
+        write(tmp_path / f"{name}.png")
+    broken = {"id": 17, "image_id": 8, "category_id": 1, **annotation}
+    images = [*coco()["images"], {**coco()["images"][0], "id": 8, "file_name": "two.png"}]
+    write(tmp_path / "labels.json", coco(images=images, annotations=[*coco()["annotations"], broken]))
+    report = convert(read_coco(tmp_path, LabelMapping(drivable=("road",))), tmp_path / "out")
+    assert DrivingDataset(tmp_path / "out", "train").names == ["one"]
+    assert report.dropped["train"]["image: labels or image broken"] == 1
+    assert f"labels.json: image 'two.png', annotation 17: {message}" in caplog.text

@@ -93,10 +93,6 @@ def test_errors(tmp_path: Path) -> None:
     path.write_text(XML)
     with pytest.raises(DataError, match="none of the images"):
         read_cvat(tmp_path)
-    cv2.imwrite(str(tmp_path / "one.png"), np.zeros((*SIZE, 3), np.uint8))
-    path.write_text(XML.replace('xtl="1"', 'xtl="x"'))
-    with pytest.raises(DataError, match="not as CVAT has it"):
-        read_cvat(tmp_path)
 
 
 def read_shapes(
@@ -151,10 +147,24 @@ def test_labels_made_at_another_size_are_left_out(tmp_path: Path, size: str, ima
     assert convert(read_cvat(tmp_path), tmp_path / "out").images == {"train": images}
 
 
-@pytest.mark.parametrize("points", ["1;2;3;4", "1,2,3;4,5,6", "1,2;3"])
-def test_points_are_pairs(tmp_path: Path, points: str) -> None:
-    with pytest.raises(DataError, match="not as CVAT has it"):
-        read_shapes(tmp_path, f'<polygon label="car" points="{points}"></polygon>', LabelMapping())
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        ('<polygon label="car" points="1;2;3;4"/>', "polygon of label 'car': points must be numbers 'x,y;x,y;...'"),
+        ('<polygon label="car" points="1,2,3;4,5,6"/>', "polygon of label 'car': points must be numbers"),
+        ('<polygon label="car" points="1,2;3"/>', "polygon of label 'car': points must be numbers"),
+        ('<polyline label="lane" points=""/>', "polyline of label 'lane': points must be numbers"),
+        ('<box label="car" xtl="x" ytl="2" xbr="9" ybr="7"/>', "box of label 'car': xtl, ytl, xbr, ybr and rotation"),
+        ('<box label="car" xtl="1" ytl="2" xbr="9"/>', "box of label 'car': xtl, ytl, xbr, ybr and rotation"),
+        ('<mask label="car" rle="" left="1" top="2" width="3" height="4"/>', "mask of label 'car': left, top, width"),
+        ('<box label="car" z_order="x"/>', "not as CVAT has it"),
+    ],
+)
+def test_an_image_with_a_broken_shape_is_left_out_and_named(tmp_path: Path, shape: str, message: str) -> None:
+    with pytest.raises(DataError, match=f"image 'one.png', {message}"):
+        read_shapes(tmp_path, shape, LabelMapping())
+    report = convert(read_cvat(tmp_path), tmp_path / "out")
+    assert report.dropped["train"] == {"image: labels or image broken": 1}
 
 
 def test_labels_that_all_mean_nothing_are_refused(tmp_path: Path) -> None:

@@ -13,8 +13,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from trilitenet.data.records import AreaLabel, CocoRuns, ImageRecord, LaneLabel, ListedRecords, ObjectLabel
+from trilitenet.data.records import (
+    AreaLabel,
+    BrokenRecord,
+    CocoRuns,
+    ImageRecord,
+    LaneLabel,
+    ListedRecords,
+    ObjectLabel,
+)
 from trilitenet.errors import DataError, brief
 from trilitenet.formats.readers.mapping import SPLIT_NAMES, LabelMapping, Shapes, find_image, read_json
 
@@ -122,14 +131,20 @@ def _read_file(
             for word in dict.fromkeys([_split_of(path, split), split]):  # a single file's name may say where to look
                 folders += [root / word, root / "images" / word]
                 folders += [folder for folder in sorted(root.glob(f"*{word}*")) if folder.is_dir()]
-        records, missing = [], 0
+        records: list[ImageRecord] = []
+        missing = 0
         for image in content["images"]:
             place = find_image(str(image["file_name"]), folders)
             if place is None:
                 missing += 1
                 continue
             size = (int(image["height"]), int(image["width"]))
-            objects, shapes, dropped = _read_labels(labels[image["id"]], names, mapping)
+            try:
+                objects, shapes, dropped = _read_labels(labels[image["id"]], names, mapping)
+            except DataError as error:
+                reason = f"{path}: image {image['file_name']!r}, {error}"
+                records.append(BrokenRecord(place.stem, place, reason=reason))
+                continue
             records.append(
                 ImageRecord(
                     name=place.stem,
@@ -156,30 +171,65 @@ def _read_labels(
     shapes = Shapes()
     dropped: Counter[str] = Counter()
     for item in items:
-        category = names.get(item["category_id"], str(item["category_id"]))
-        kind = mapping.area_kind(category)
-        segmentation = item.get("segmentation")
-        if category not in mapping.lane and kind in {None, "ignore"}:
-            left, top, width, height = (float(value) for value in item["bbox"])
-            crowd = bool(item.get("iscrowd")) or kind == "ignore"
-            objects.append(ObjectLabel(category, (left, top, left + width, top + height), crowd))
-            if kind is None or not segmentation:
-                continue
-        if not segmentation:
-            dropped[f"{category}: without a segmentation"] += 1
-        elif isinstance(segmentation, dict):
-            counts = segmentation["counts"]
-            runs = CocoRuns(
-                kind or "direct",
-                (int(segmentation["size"][0]), int(segmentation["size"][1])),
-                counts if isinstance(counts, str) else tuple(int(count) for count in counts),
-            )
-            (shapes.lanes if category in mapping.lane else shapes.areas).append(runs)
-        else:
-            for polygon in segmentation:
-                points = np.array(polygon, np.float64).reshape(-1, 2)
-                if category in mapping.lane:
-                    shapes.lanes.append(LaneLabel(category, points, closed=True))
-                else:
-                    shapes.areas.append(AreaLabel(kind or "direct", points))
+        try:
+            _read_label(item, names, mapping, objects, shapes, dropped)
+        except DataError as error:
+            raise DataError(f"annotation {item.get('id', '')!r}: {error}") from error
     return objects, shapes, dropped
+
+
+def _read_label(
+    item: dict[str, Any],
+    names: dict[Any, str],
+    mapping: LabelMapping,
+    objects: list[ObjectLabel],
+    shapes: Shapes,
+    dropped: Counter[str],
+) -> None:
+    number = item.get("category_id")
+    if not isinstance(number, (int, float, str)):
+        raise DataError("category_id must be the id of a category")
+    category = names.get(number, str(number))
+    kind = mapping.area_kind(category)
+    segmentation = item.get("segmentation")
+    if category not in mapping.lane and kind in {None, "ignore"}:
+        objects.append(ObjectLabel(category, _box(item.get("bbox")), bool(item.get("iscrowd")) or kind == "ignore"))
+        if kind is None or not segmentation:
+            return
+    if not segmentation:
+        dropped[f"{category}: without a segmentation"] += 1
+    elif isinstance(segmentation, dict):
+        runs = _runs(segmentation, kind or "direct")
+        (shapes.lanes if category in mapping.lane else shapes.areas).append(runs)
+    elif isinstance(segmentation, list):
+        for points in map(_points, segmentation):
+            if category in mapping.lane:
+                shapes.lanes.append(LaneLabel(category, points, closed=True))
+            else:
+                shapes.areas.append(AreaLabel(kind or "direct", points))
+    else:
+        raise DataError("segmentation must be a list of polygons, or run lengths")
+
+
+def _box(bbox: Any) -> tuple[float, float, float, float]:
+    try:
+        left, top, width, height = map(float, bbox)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise DataError("bbox must be 4 numbers (left, top, width, height)") from error
+    return left, top, left + width, top + height
+
+
+def _runs(segmentation: dict[str, Any], kind: str) -> CocoRuns:
+    try:
+        height, width = map(int, segmentation["size"])
+        counts = segmentation["counts"]
+        return CocoRuns(kind, (height, width), counts if isinstance(counts, str) else tuple(map(int, counts)))
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
+        raise DataError("run lengths need a size (height, width) and counts") from error
+
+
+def _points(polygon: Any) -> NDArray[np.float64]:
+    try:
+        return np.array(polygon, np.float64).reshape(-1, 2)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise DataError("a polygon must be an even number of coordinates (x, y, x, y, ...)") from error

@@ -9,17 +9,24 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from pathlib import Path
+from typing import Final
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ListedRecords, ObjectLabel, RowRuns
+from trilitenet.data.records import AreaLabel, BrokenRecord, ImageRecord, LaneLabel, ListedRecords, ObjectLabel, RowRuns
 from trilitenet.errors import DataError, brief
 from trilitenet.formats.readers.mapping import SPLIT_NAMES, LabelMapping, Shapes, find_image, hull
 
 __all__ = ["read_cvat"]
 
+_NEEDED: Final = {
+    "box": "xtl, ytl, xbr, ybr and rotation must be numbers",
+    "polygon": "points must be numbers 'x,y;x,y;...'",
+    "polyline": "points must be numbers 'x,y;x,y;...'",
+    "mask": "left, top, width, height and rle must be whole numbers",
+}
 _SHAPES = {"box", "polygon", "polyline", "mask", "points", "ellipse", "cuboid", "skeleton", "tag"}
 
 
@@ -101,8 +108,10 @@ def _read_file(
         try:
             objects, shapes, attributes, dropped = _read_image(element, mapping)
             size = (int(element.get("height") or 0), int(element.get("width") or 0))
-        except (KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{path}: image {name!r} is not as CVAT has it ({brief(error)})") from error
+        except (KeyError, ValueError) as error:
+            what = str(error) if isinstance(error, DataError) else f"not as CVAT has it ({brief(error)})"
+            records[split].append(BrokenRecord(place.stem, place, reason=f"{path}: image {name!r}, {what}"))
+            continue
         records[split].append(
             ImageRecord(
                 name=place.stem,
@@ -126,37 +135,51 @@ def _read_image(
     attributes: dict[str, str] = {}
     dropped: Counter[str] = Counter()
     for shape in sorted(element, key=lambda item: int(item.get("z_order") or 0)):
-        label = shape.get("label", "")
-        own = {item.get("name", ""): item.text or "" for item in shape.findall("attribute")}
-        kind = mapping.area_kind(label)
-        if shape.tag == "tag":
-            attributes |= own
-        elif shape.tag == "box":
-            # Text, of which "false" would be true.
-            crowd = own.pop("crowd", "").strip().lower() == "true"
-            more: dict[str, str | bool | float] = {**own, "crowd": crowd, "occluded": shape.get("occluded") == "1"}
-            objects.append(ObjectLabel(label, _box(shape), crowd, more))
-        elif shape.tag in {"polygon", "polyline"}:
-            points = _points(shape.attrib["points"])
-            closed = shape.tag == "polygon"
-            if label in mapping.lane:
-                shapes.lanes.append(LaneLabel(label, points, closed=closed, edge=mapping.lane_edges and not closed))
-            elif closed:
-                objects += shapes.add(AreaLabel(kind or "direct", points), ObjectLabel(label, hull(points)), kind)
-            else:
-                objects.append(ObjectLabel(label, hull(points), crowd=kind == "ignore"))
-        elif shape.tag == "mask":
-            left, top, width, height = (int(shape.attrib[key]) for key in ("left", "top", "width", "height"))
-            lengths = tuple(int(run) for run in shape.attrib["rle"].split(","))
-            runs = RowRuns(kind or "direct", left, top, width, height, lengths)
-            if label in mapping.lane:
-                shapes.lanes.append(runs)
-            else:
-                corners = (float(left), float(top), float(left + width), float(top + height))
-                objects += shapes.add(runs, ObjectLabel(label, corners), kind)
-        elif shape.tag in _SHAPES:
-            dropped[f"shape of kind {shape.tag!r}"] += 1
+        try:
+            _read_shape(shape, mapping, objects, shapes, attributes, dropped)
+        except (KeyError, ValueError) as error:
+            raise DataError(f"{shape.tag} of label {shape.get('label', '')!r}: {_NEEDED[shape.tag]}") from error
     return objects, shapes, attributes, dropped
+
+
+def _read_shape(
+    shape: ElementTree.Element,
+    mapping: LabelMapping,
+    objects: list[ObjectLabel],
+    shapes: Shapes,
+    attributes: dict[str, str],
+    dropped: Counter[str],
+) -> None:
+    label = shape.get("label", "")
+    own = {item.get("name", ""): item.text or "" for item in shape.findall("attribute")}
+    kind = mapping.area_kind(label)
+    if shape.tag == "tag":
+        attributes |= own
+    elif shape.tag == "box":
+        # Text, of which "false" would be true.
+        crowd = own.pop("crowd", "").strip().lower() == "true"
+        more: dict[str, str | bool | float] = {**own, "crowd": crowd, "occluded": shape.get("occluded") == "1"}
+        objects.append(ObjectLabel(label, _box(shape), crowd, more))
+    elif shape.tag in {"polygon", "polyline"}:
+        points = _points(shape.attrib["points"])
+        closed = shape.tag == "polygon"
+        if label in mapping.lane:
+            shapes.lanes.append(LaneLabel(label, points, closed=closed, edge=mapping.lane_edges and not closed))
+        elif closed:
+            objects += shapes.add(AreaLabel(kind or "direct", points), ObjectLabel(label, hull(points)), kind)
+        else:
+            objects.append(ObjectLabel(label, hull(points), crowd=kind == "ignore"))
+    elif shape.tag == "mask":
+        left, top, width, height = (int(shape.attrib[key]) for key in ("left", "top", "width", "height"))
+        lengths = tuple(int(run) for run in shape.attrib["rle"].split(","))
+        runs = RowRuns(kind or "direct", left, top, width, height, lengths)
+        if label in mapping.lane:
+            shapes.lanes.append(runs)
+        else:
+            corners = (float(left), float(top), float(left + width), float(top + height))
+            objects += shapes.add(runs, ObjectLabel(label, corners), kind)
+    elif shape.tag in _SHAPES:
+        dropped[f"shape of kind {shape.tag!r}"] += 1
 
 
 def _box(shape: ElementTree.Element) -> tuple[float, float, float, float]:
