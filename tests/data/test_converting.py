@@ -388,3 +388,15 @@ def test_ignored_areas_are_drawn_over_all() -> None:
     other = dataclasses.replace(road, kind="alternative", points=np.add(road.points, (4.0, 0.0)))
     mask = drivable_mask([ignored, road, other], (6, 8), keep_alternative=True)
     assert mask.tolist() == [[64] * 2 + [255] * 2 + [127] * 4] * 6
+
+
+def test_shapes_of_too_few_points_are_counted(tmp_path: Path) -> None:
+    areas = tuple(AreaLabel("direct", np.zeros((count, 2))) for count in range(4))
+    lines = tuple(LaneLabel("lane", np.zeros((count, 2))) for count in range(3))
+    outlines = tuple(LaneLabel("lane", np.zeros((count, 2)), closed=True) for count in range(4))
+    record = picture(tmp_path / "raw/a.png", drivable=areas, lane=lines + outlines)
+    report = convert(Records(train=[record]), tmp_path / "out")
+    assert report.dropped["train"] == {"area with too few points": 3, "lane with too few points": 5}
+    assert report.lanes["train"] == {"outlines": 1, "single lines": 1}
+    whole = picture(tmp_path / "raw/b.png", drivable=areas[3:], lane=lines[2:])
+    assert convert(Records(train=[whole]), tmp_path / "other").dropped == {"train": {}}

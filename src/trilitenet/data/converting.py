@@ -72,6 +72,9 @@ ALTERNATIVE_VALUE: Final = 127
 IGNORE_VALUE: Final = 64
 """Mask value of pixels that are neither foreground nor background."""
 
+_CORNERS: Final = 3
+"""An area with fewer has no pixel."""
+
 _STATE_FOLDER: Final = ".conversion"
 
 
@@ -287,6 +290,8 @@ def lane_mask(
             dropped["lane: across the road"] += 1
         elif options.lane_categories and lane.category not in options.lane_categories:
             dropped[f"lane: {lane.category}"] += 1
+        elif len(lane.points) < (_CORNERS if lane.closed else 2):
+            dropped["lane with too few points"] += 1
         elif lane.closed:
             fill_polygon(mask, lane.points, 255)
             drawn["outlines"] += 1
@@ -392,6 +397,9 @@ def _convert_one(record: ImageRecord, split: str, root: Path, options: Conversio
             mask = _mask_of(record.drivable, size, keep_alternative=options.keep_alternative)
         else:
             mask = drivable_mask(record.drivable, size, keep_alternative=options.keep_alternative)
+            dropped["area with too few points"] += sum(
+                isinstance(area, AreaLabel) and len(area.points) < _CORNERS for area in record.drivable
+            )
         _write_mask(root / DRIVABLE_FOLDER / split / f"{record.name}.png", mask)
         summary["labelled"].append("drivable")
     if record.lane is not None:
@@ -405,7 +413,7 @@ def _convert_one(record: ImageRecord, split: str, root: Path, options: Conversio
         summary["labelled"].append("lane")
     if _has_ignored(record.drivable) or _has_ignored(record.lane):
         summary["ignore_value"] = True
-    summary["dropped"] = dict(sorted(dropped.items()))
+    summary["dropped"] = dict(sorted((+dropped).items()))
     # The image comes last: where it is, its labels are complete.
     _place_image(record.image, root / IMAGE_FOLDER / split / f"{record.name}{record.image.suffix.lower()}", options)
     summary["image"] = f"{record.name}{record.image.suffix.lower()}"

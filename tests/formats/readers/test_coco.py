@@ -248,3 +248,11 @@ def test_an_image_with_a_broken_annotation_is_left_out_and_named(
     assert DrivingDataset(tmp_path / "out", "train").names == ["one"]
     assert report.dropped["train"]["image: labels or image broken"] == 1
     assert f"labels.json: image 'two.png', annotation 17: {message}" in caplog.text
+
+
+def test_areas_of_too_few_points_are_counted(tmp_path: Path) -> None:
+    write(tmp_path / "one.png")
+    area = {"image_id": 7, "category_id": 2, "segmentation": [[], [1, 2], [1, 2, 3, 4], [1, 1, 9, 1, 9, 9]]}
+    write(tmp_path / "labels.json", coco(annotations=[area]))
+    report = convert(read_coco(tmp_path, LabelMapping(drivable=("road",))), tmp_path / "out")
+    assert report.dropped["train"] == {"area with too few points": 3}
