@@ -114,6 +114,10 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "box outside": ("box-outside", lambda root: annotate(root, box(100, 10, 140, 30))),
     "box twice": ("box-twice", lambda root: annotate(root, box(10, 10, 40, 30), box(10, 10, 40, 30))),
     "unknown category": ("category-unknown", lambda root: annotate(root, box(10, 10, 40, 30, "cra"))),
+    "no box of a class": (
+        "no-class",
+        lambda root: (root / "dataset.yaml").open("a").write("classes: {vehicle: [lorry]}\n"),
+    ),
     "orphan annotation": (
         "orphan",
         lambda root: write_annotation(root, "train", "gone", []),
@@ -181,7 +185,7 @@ def test_all_kinds_are_planted() -> None:
 ONE_PLACE = (
     "swapped corners", "infinite box", "box outside", "box twice", "unknown category",
     "mask values", "mask of 16 bits", "mask of another size", "no label at all", "one name twice", "two endings",
-    "index is not UTF-8",
+    "index is not UTF-8", "no box of a class",
 )  # fmt: skip
 """Faults planted in the same file as another, so that only the last one would be there."""
 

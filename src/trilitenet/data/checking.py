@@ -55,6 +55,7 @@ KINDS: Final[dict[str, str]] = {
     "box-outside": "a box reaches out of the image",
     "box-twice": "the same box twice in one image",
     "category-unknown": "a category that is neither in a class nor one of BDD100K's",
+    "no-class": "there are boxes, and none is of a class",
     "orphan": "an annotation or a mask without its image",
     "unlabelled": "an image without any label",
     "name-in-two-splits": "the same name in two splits",
@@ -276,6 +277,7 @@ def check_dataset(
     except DataError as error:
         collector.add("index", "", str(error))
         index = []
+    _find_classes(job, facts, collector)
     _find_orphans(root, names, collector)
     _find_names(facts, collector)
     _find_duplicates(facts, collector)
@@ -482,6 +484,12 @@ def _look_at_mask(
     return float(counts[foreground].sum() / counts.sum())
 
 
+def _find_classes(job: _Job, facts: dict[str, list[_Facts]], collector: _Collector) -> None:
+    found = {category for items in facts.values() for fact in items for category in fact.objects} - {"ignored"}
+    if found and not found & job.table.keys() and "detection" in job.description.tasks:
+        collector.add("no-class", "", f"boxes are of {_listed(found)}; classes are of {_listed(job.table)}")
+
+
 def _find_orphans(root: Path, names: dict[str, list[str]], collector: _Collector) -> None:
     for folder in (DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER):
         if not (root / folder).is_dir():
@@ -612,8 +620,8 @@ def _sorted(counts: Counter[str]) -> dict[str, int]:
     return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
 
 
-def _listed(values: Iterable[int]) -> str:
-    ordered: Sequence[int] = sorted(values)
+def _listed(values: Iterable[int] | Iterable[str]) -> str:
+    ordered: Sequence[int | str] = sorted(values)
     return ", ".join(map(str, ordered[:8])) + (", ..." if len(ordered) > 8 else "")
 
 
