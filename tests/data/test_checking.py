@@ -123,6 +123,11 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object]]] = {
         lambda root: write_annotation(root, "train", "gone", []),
     ),
     "orphan mask": ("orphan", lambda root: draw_mask(root, np.zeros((72, 128), np.uint8), "gone")),
+    "annotation in capitals": ("not-read", lambda root: (root / "det_annotations/val/val_0003.JSON").write_text("{}")),
+    "mask of another kind": (
+        "not-read",
+        lambda root: cv2.imwrite(str(root / "da_seg_annotations/val/val_0003.bmp"), np.zeros((72, 128), np.uint8)),
+    ),
     "no label at all": (
         "unlabelled",
         lambda root: unlink(*root.glob("*_annotations/train/train_0000.*")),
@@ -170,6 +175,16 @@ def test_every_planted_fault_is_found_and_nothing_else(root: Path, fault: str) -
     assert not report.ok
 
 
+def test_a_file_that_is_not_read_is_named_with_the_cure(root: Path) -> None:
+    for name in ("x.PNG", "y.bmp", ".z.bmp"):
+        (root / f"ll_seg_annotations/val/{name}").touch()
+    (finding,) = check_dataset(root).findings
+    assert finding.examples == (
+        "ll_seg_annotations/val/x.PNG is not read; rename it to .png",
+        "ll_seg_annotations/val/y.bmp is not read; save it as .png",
+    )
+
+
 def test_an_ego_mask_of_a_name_that_no_system_has(root: Path) -> None:
     (root / "dataset.yaml").write_text('ego_mask: "\\uD800.png"\n')
     assert kinds(check_dataset(root)) == {"ego-mask"}
@@ -193,7 +208,7 @@ ONE_PLACE = (
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_faults_do_not_hide_one_another(root: Path) -> None:
     planted = {fault: FAULTS[fault] for fault in FAULTS if fault not in ONE_PLACE}
-    assert len(planted) == 17
+    assert len(planted) == 19
     for _, plant in planted.values():
         plant(root)
     assert kinds(check_dataset(root)) == {kind for kind, _ in planted.values()}

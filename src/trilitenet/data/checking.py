@@ -32,6 +32,7 @@ from trilitenet.data.reading import (
     DRIVABLE_FOLDER,
     IMAGE_ENDINGS,
     IMAGE_FOLDER,
+    LABEL_FILES,
     LANE_FOLDER,
     decode_mask,
     is_crowd,
@@ -57,6 +58,7 @@ KINDS: Final[dict[str, str]] = {
     "category-unknown": "a category that is neither in a class nor one of BDD100K's",
     "no-class": "there are boxes, and none is of a class",
     "orphan": "an annotation or a mask without its image",
+    "not-read": "a file among the annotations or masks whose ending is not the one that is read",
     "unlabelled": "an image without any label",
     "name-in-two-splits": "the same name in two splits",
     "name-twice": "images that differ in their ending alone, and would have the same labels",
@@ -491,14 +493,20 @@ def _find_classes(job: _Job, facts: dict[str, list[_Facts]], collector: _Collect
 
 
 def _find_orphans(root: Path, names: dict[str, list[str]], collector: _Collector) -> None:
-    for folder in (DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER):
+    """Look for label files that belong to no image, or that are passed over for their ending."""
+    for folder, ending in LABEL_FILES.values():
         if not (root / folder).is_dir():
             continue
         for split in sorted(path.name for path in (root / folder).iterdir() if path.is_dir()):
             images = {Path(name).stem for name in names.get(split, ())}
             for path in sorted((root / folder / split).iterdir()):
-                if path.suffix in {".json", ".png"} and path.stem not in images:
-                    collector.add("orphan", split, path.relative_to(root).as_posix())
+                where = path.relative_to(root).as_posix()
+                if path.suffix == ending:
+                    if path.stem not in images:
+                        collector.add("orphan", split, where)
+                elif path.is_file() and not path.name.startswith("."):
+                    cure = "rename it to" if path.suffix.lower() == ending else "save it as"
+                    collector.add("not-read", split, f"{where} is not read; {cure} {ending}")
 
 
 def _find_names(facts: dict[str, list[_Facts]], collector: _Collector) -> None:
