@@ -16,7 +16,7 @@ from trilitenet.data.description import (
     read_description,
     write_description,
 )
-from trilitenet.data.reading import DrivingDataset, MixedDataset, decode_image, decode_mask, sampling_weights
+from trilitenet.data.reading import DrivingDataset, MixedDataset, decode_image, decode_mask, is_crowd, sampling_weights
 from trilitenet.data.sample import Sample
 from trilitenet.errors import DataError, ShapeError
 
@@ -42,6 +42,15 @@ def test_any_subset_of_the_tasks(root: Path) -> None:
         assert (sample.boxes is None) == (index % 7 == 6)
         if sample.drivable is not None:
             assert set(np.unique(sample.drivable)) == {0, 1}
+
+
+@pytest.mark.parametrize(
+    ("value", "crowd"),
+    [(True, True), (1, True), (0.5, True), ("true", True), ("Yes", True), ("1", True), (False, False), (0, False),
+     (0.0, False), ("0.0", False), ("No", False), (" false", False), ("", False), ([], False), (None, False)],
+)  # fmt: skip
+def test_what_marks_a_crowd(value: object, crowd: bool) -> None:
+    assert is_crowd({"attributes": {"crowd": value}}) == crowd
 
 
 def test_an_image_is_rgb(root: Path) -> None:

@@ -183,7 +183,10 @@ def parse_annotation(
 
 def is_crowd(item: Mapping[str, Any]) -> bool:
     """Return whether an object of an annotation is marked as a crowd; tools that know text alone write ``"false"``."""
-    return str((item.get("attributes") or {}).get("crowd", False)).strip().lower() not in {"", "0", "false", "none"}
+    crowd = (item.get("attributes") or {}).get("crowd")
+    if isinstance(crowd, str):
+        return crowd.strip().lower() not in {"", "0", "0.0", "false", "no", "none"}
+    return bool(crowd)
 
 
 class DrivingDataset:
