@@ -215,6 +215,15 @@ def test_mixed_data_sets(root: Path, tmp_path: Path) -> None:
         sampling_weights(one, {"timeofday": {"night": 0.0, "day": 0.0, "": 0.0}})
 
 
+def test_what_no_image_has_to_sample_by_is_told(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    dataset = DrivingDataset(root, "train")
+    sampling_weights(dataset, {"timeofday": {"nigth": 2.0, "day": 1.0, "": 1.0}, "timeofdya": {"night": 2.0}})
+    assert caplog.messages == [
+        "no image has the timeofday 'nigth' to sample by; did you mean 'night'?",
+        "no image has the attribute 'timeofdya' to sample by; did you mean 'timeofday'?",
+    ]
+
+
 def test_a_sample_is_checked() -> None:
     image = np.zeros((4, 6, 3), np.uint8)
     with pytest.raises(ShapeError, match="uint8"):

@@ -442,14 +442,21 @@ def sampling_weights(dataset: SampleSource, table: Mapping[str, Mapping[str, flo
             if not factor >= 0:
                 raise DataError(f"sampling weight of {attribute}={value} must not be negative, got {factor}")
     if table:
-        known: set[str] = set()
+        known: dict[str, set[str]] = {}
         for index in range(len(dataset)):
             attributes = dataset.attributes(index)
-            known |= attributes.keys()
+            for attribute, value in attributes.items():
+                known.setdefault(attribute, set()).add(value)
             for attribute, factors in table.items():
                 weights[index] *= factors.get(attributes.get(attribute, ""), 1.0)
-        for attribute in sorted(table.keys() - known):
-            _LOGGER.warning("no image has the attribute %r to sample by%s", attribute, did_you_mean(attribute, known))
+        for attribute, factors in table.items():
+            if attribute not in known:
+                hint = did_you_mean(attribute, known)
+                _LOGGER.warning("no image has the attribute %r to sample by%s", attribute, hint)
+                continue
+            for value in sorted(factors.keys() - known[attribute] - {""}):  # which are the images without it
+                hint = did_you_mean(value, known[attribute])
+                _LOGGER.warning("no image has the %s %r to sample by%s", attribute, value, hint)
     if not weights.any():
         raise DataError("every sampling weight is 0")
     return weights
