@@ -207,11 +207,19 @@ ONE_PLACE = (
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_faults_do_not_hide_one_another(root: Path) -> None:
-    planted = {fault: FAULTS[fault] for fault in FAULTS if fault not in ONE_PLACE}
-    assert len(planted) == 19
+    planted = _planted_at_once()
     for _, plant in planted.values():
         plant(root)
     assert kinds(check_dataset(root)) == {kind for kind, _ in planted.values()}
+
+
+def _planted_at_once() -> dict[str, tuple[str, Callable[[Path], object]]]:
+    return {fault: planted for fault, planted in FAULTS.items() if fault not in ONE_PLACE}
+
+
+def test_the_documentation_says_how_many_are_planted() -> None:
+    words = f"{len(FAULTS)} faults of all {len(KINDS)} kinds one by one, and {len(_planted_at_once())} at once;"
+    assert words in (Path(__file__).resolve().parents[2] / "docs/data.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
