@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -158,6 +159,33 @@ def test_writing_refuses_to_mix_with_what_is_there(tmp_path: Path) -> None:
     write_dataset(tmp_path, "train", count=1, seed=2, size=SIZE)
     with pytest.raises(ConfigError, match="at least 1"):
         write_dataset(tmp_path, "more", count=0)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_same_call_goes_on_where_one_was_interrupted(tmp_path: Path, workers: int) -> None:
+    def stop(done: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    def files(root: Path) -> dict[str, bytes]:
+        return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+    call = functools.partial(write_dataset, split="val", count=4, seed=3, size=SIZE)
+    call(tmp_path / "whole")
+    root = tmp_path / "parts"
+    with pytest.raises(KeyboardInterrupt):
+        call(root, progress=stop)
+    first = root / "images/val/synthetic_3_000000.jpg"
+    before = first.stat().st_mtime_ns
+    assert files(root).keys() - files(tmp_path / "whole").keys() == {".synthesis-val.json"}
+    (root / "images/val/.synthetic_3.01234567.part").write_bytes(b"half")
+    with pytest.raises(OutputError, match=r"images/val is not empty, and not what the same command left"):
+        call(root, count=5)
+    call(root, workers=workers)
+    assert files(root) == files(tmp_path / "whole")
+    assert first.stat().st_mtime_ns == before
+    with pytest.raises(OutputError, match="not empty"):
+        call(root)
 
 
 def test_an_image_that_is_there_has_its_labels_when_the_disk_is_full(

@@ -47,6 +47,8 @@ def synthesize(
 ) -> Synthesized:
     """Write synthetic road scenes with labels for all three tasks, in the published layout.
 
+    Run again after an interruption, the same command goes on where it stood.
+
     Args:
         output: Folder of the data set.
         count: How many scenes.
@@ -58,7 +60,7 @@ def synthesize(
         workers: Processes to share the work.
 
     Raises:
-        OutputError: If the split is there already.
+        OutputError: If the split is there already, whole or of another command.
     """
     steps = iter(track(range(count), "scenes", transient=True, console=Console(stderr=True)))
 

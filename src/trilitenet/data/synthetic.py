@@ -151,6 +151,10 @@ class SyntheticScenes:
     def __getitem__(self, index: int) -> Sample:
         return self.scene(index).sample
 
+    def name(self, index: int) -> str:
+        """Return what scene ``index`` is called, without drawing it."""
+        return f"synthetic_{self.seed}_{index:06d}"
+
     def scene(self, index: int) -> Scene:
         """Return scene ``index`` with its truth.
 
@@ -162,7 +166,7 @@ class SyntheticScenes:
         rng = np.random.default_rng((self.seed, index))
         world = random_world(rng, self.size)
         drawn = render(world, rng, faults=self.faults)
-        return label_scene(world, drawn, f"synthetic_{self.seed}_{index:06d}", labels=self.labels)
+        return label_scene(world, drawn, self.name(index), labels=self.labels)
 
 
 _TIMES: Final = {"day": "daytime", "dusk": "dawn/dusk", "night": "night"}

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -39,7 +40,8 @@ def write_dataset(
 
     ``images/{split}/NAME.jpg``, ``det_annotations/{split}/NAME.json`` (BDD100K's form an image; uncertain vehicles have
     ``attributes.crowd: true``), ``da_seg_annotations/{split}/NAME.png`` and ``ll_seg_annotations/{split}/NAME.png``
-    (255 = drivable or lane line), and ``dataset.yaml``.
+    (255 = drivable or lane line), and ``dataset.yaml``. The same call goes on where one was interrupted; until the
+    split is whole, ``.synthesis-{split}.json`` says of what call it is.
 
     Args:
         root: Folder to write into.
@@ -54,7 +56,7 @@ def write_dataset(
     Raises:
         ConfigError: If ``count`` or ``workers`` is under 1, the seed negative, the size too small, or ``split`` no name
             of one folder.
-        OutputError: If the split exists already, or a file cannot be written.
+        OutputError: If the split exists already, whole or of another call, or a file cannot be written.
     """
     if count < 1 or workers < 1:
         raise ConfigError(f"count and workers must be at least 1, got {count} and {workers}")
@@ -64,11 +66,22 @@ def write_dataset(
     root = Path(root)
     if Path(split).name != split or split in {"", ".", ".."}:
         raise ConfigError(f"split must be the name of one folder, got {split!r}")
-    if any((root / FOLDERS[0] / split).glob("*")):
-        raise OutputError(f"{root / FOLDERS[0] / split} is not empty; choose another folder or split, or remove it")
+    state = root / f".synthesis-{split}.json"
+    call = json.dumps({"seed": seed, "count": count, "size": size, "labels": labels}).encode()
+    images = root / IMAGE_FOLDER / split
+    if any(images.glob("*")) and not (state.is_file() and state.read_bytes() == call):
+        raise OutputError(
+            f"{images} is not empty, and not what the same command left when it was interrupted; "
+            "choose another folder or split, or remove it"
+        )
     try:
+        root.mkdir(parents=True, exist_ok=True)
+        with replacing(state) as part:
+            part.write_bytes(call)
         for folder in FOLDERS:
             (root / folder / split).mkdir(parents=True, exist_ok=True)
+            for part in (root / folder / split).glob(".*.part"):  # of a process that was killed
+                part.unlink()
         if not (root / DESCRIPTION_FILE).exists():
             write_description(
                 root,
@@ -81,16 +94,15 @@ def write_dataset(
                 ),
             )
         job = functools.partial(_write_scene, root, split, seed, size, labels, count)
-        if workers == 1:
-            for done in range(count):
-                job(done)
+        with contextlib.ExitStack() as stack:
+            if workers == 1:
+                scenes: Iterator[None] = map(job, range(count))
+            else:
+                scenes = stack.enter_context(ProcessPool(workers)).map(job, range(count), chunksize=4)
+            for done, _ in enumerate(scenes, start=1):
                 if progress:
-                    progress(done + 1)
-            return
-        with ProcessPool(workers) as pool:
-            for done, _ in enumerate(pool.map(job, range(count), chunksize=4)):
-                if progress:
-                    progress(done + 1)
+                    progress(done)
+        state.unlink()
     except OSError as error:
         raise OutputError(f"{root}: cannot write ({error})") from error
 
@@ -98,7 +110,9 @@ def write_dataset(
 def _write_scene(
     root: Path, split: str, seed: int, size: tuple[int, int], labels: Literal["lines", "paint"], count: int, index: int
 ) -> None:
-    write_sample(root, split, SyntheticScenes(seed, size, count, labels=labels)[index])
+    scenes = SyntheticScenes(seed, size, count, labels=labels)
+    if not (root / IMAGE_FOLDER / split / f"{scenes.name(index)}.jpg").exists():
+        write_sample(root, split, scenes[index])
 
 
 def write_sample(root: Path, split: str, sample: Sample) -> None:
