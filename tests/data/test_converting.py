@@ -12,10 +12,7 @@ import pytest
 from PIL import Image
 
 from tests.formats.readers import raw_bdd
-from trilitenet.data.converting import ConversionOptions, convert, lane_mask
-
-
-from trilitenet.data.converting import ConversionOptions, convert, drivable_mask
+from trilitenet.data.converting import ConversionOptions, convert, drivable_mask, lane_mask
 from trilitenet.data.description import read_description
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.records import AreaLabel, CocoRuns, ImageRecord, LaneLabel, MaskFile, ObjectLabel, RowRuns
