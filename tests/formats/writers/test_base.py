@@ -79,20 +79,26 @@ def test_output_that_is_a_file_is_an_error(tmp_path: Path, pictures: list[Percep
         writer.write(pictures[0])
 
 
-@pytest.fixture
-def ctrl_c() -> Iterator[Any]:
-    """Python's own answer to Ctrl-C, which a process that a shell put into the background lacks."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield signal.default_int_handler
-    signal.signal(signal.SIGINT, before)
+@pytest.fixture(params=[signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "sigterm"])
+def interruption(request: pytest.FixtureRequest) -> Iterator[signal.Signals]:
+    """A signal that interrupts: a process that a shell put into the background ignores Ctrl-C."""
+    number: signal.Signals = request.param
+    before = signal.signal(number, signal.default_int_handler)
+    yield number
+    signal.signal(number, before)
 
 
 @pytest.mark.parametrize(
     ("name", "step"),
     [("coco", "coco.encode_mask"), ("cvat", "cvat.cvat_mask"), ("openlabel", "base.dumps"), ("scalabel", "base.dumps")],
 )
-def test_ctrl_c_waits_until_a_result_is_whole(
-    name: str, step: str, tmp_path: Path, pictures: list[Perception], monkeypatch: pytest.MonkeyPatch, ctrl_c: Any
+def test_an_interruption_waits_until_a_result_is_whole(
+    name: str,
+    step: str,
+    tmp_path: Path,
+    pictures: list[Perception],
+    monkeypatch: pytest.MonkeyPatch,
+    interruption: signal.Signals,
 ) -> None:
     steps = 0
 
@@ -105,7 +111,7 @@ def test_ctrl_c_waits_until_a_result_is_whole(
             def interrupted(value: Any) -> Any:
                 nonlocal steps
                 steps += 1
-                signal.raise_signal(signal.SIGINT)
+                signal.raise_signal(interruption)
                 return plain(value)
 
             monkeypatch.setattr(f"{module}.{function}", interrupted)
@@ -114,7 +120,7 @@ def test_ctrl_c_waits_until_a_result_is_whole(
     with pytest.raises(KeyboardInterrupt):
         write()
     assert steps
-    assert signal.getsignal(signal.SIGINT) is ctrl_c
+    assert signal.getsignal(interruption) is signal.default_int_handler
     if name == "openlabel":
         written = [json.loads(path.read_text())["openlabel"] for path in tmp_path.glob("*.json")]
         assert [len(one["frames"]) for one in written] == [1, 1]

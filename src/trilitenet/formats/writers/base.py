@@ -19,7 +19,7 @@ import json
 import signal
 import threading
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path, PurePath
 from types import FrameType, TracebackType
 from typing import IO, TYPE_CHECKING, Any, ClassVar, Final
@@ -30,7 +30,7 @@ from trilitenet.structures import Perception
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["WRITERS", "JsonStream", "Writer", "find_writer", "open_writer"]
+__all__ = ["WRITERS", "JsonStream", "Writer", "find_writer", "open_writer", "uninterrupted"]
 
 WRITERS: Final[dict[str, str]] = {
     "json": "trilitenet.formats.writers.native:JsonWriter",
@@ -90,7 +90,7 @@ class Writer(abc.ABC):
         """
         if self._broken:
             raise OutputError(f"{self.output}: a result could not be written, and what followed it would have a gap")
-        with _uninterrupted():
+        with uninterrupted():
             try:
                 self._write(perception, road)
             except OSError as error:
@@ -99,12 +99,12 @@ class Writer(abc.ABC):
 
     def close(self) -> None:
         """Finish every file, but none that a failed write may have left with a gap; a writer can be closed twice."""
-        with _uninterrupted():
+        with uninterrupted():
             self._close()
 
     @abc.abstractmethod
     def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
-        """Write one image or frame; Ctrl-C waits for the end of it."""
+        """Write one image or frame; Ctrl-C and SIGTERM wait for the end of it."""
 
     @abc.abstractmethod
     def _close(self) -> None:
@@ -219,20 +219,23 @@ def find_writer(format: str) -> type[Writer]:
 
 
 @contextlib.contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Let Ctrl-C, which may come between any two steps of Python, wait for the end of the block."""
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
-        yield  # no exception comes from Ctrl-C here
-        return
+def uninterrupted() -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM, which may come between any two steps of Python, wait for the end of the block."""
+    before: dict[int, Callable[[int, FrameType | None], Any]] = {}
     held: list[tuple[int, FrameType | None]] = []
-    signal.signal(signal.SIGINT, lambda number, frame: held.append((number, frame)))
+    if threading.current_thread() is threading.main_thread():
+        for interruption in (signal.SIGINT, signal.SIGTERM):
+            handler = signal.getsignal(interruption)
+            if callable(handler):  # no exception comes from others
+                before[interruption] = handler
+                signal.signal(interruption, lambda number, frame: held.append((number, frame)))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         if held:
-            before(*held[0])
+            before[held[0][0]](*held[0])
 
 
 class JsonStream:
