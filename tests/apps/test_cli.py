@@ -261,3 +261,25 @@ def test_a_reader_that_has_gone_does_not_change_the_exit_code(tmp_path: Path) ->
         told = process.stderr.read()
     assert process.returncode == 1
     assert "Traceback" not in told
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/dev/full is not everywhere")
+@pytest.mark.parametrize(
+    ("words", "streams", "code", "told"),
+    [
+        ("data check .", ">&-", 1, None),
+        ("data check .", ">&- 2>&-", 1, ""),
+        ("data check .", ">/dev/full", 1, "error: standard output: cannot be written (No space left on device)\n"),
+        ("predict -", "<&-", 1, "error: stdin: is closed\n"),
+    ],
+)
+def test_standard_streams_that_are_closed_or_full_are_no_tracebacks(
+    words: str, streams: str, code: int, told: str | None, tmp_path: Path
+) -> None:
+    (tmp_path / "images" / "train").mkdir(parents=True)
+    (tmp_path / "det_annotations" / "train").mkdir(parents=True)
+    command = f'exec "{sys.executable}" -m trilitenet {words} {streams}'
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, timeout=120, cwd=tmp_path)
+    assert done.returncode == code
+    assert "Traceback" not in done.stderr
+    assert told is None or done.stderr.endswith(told)

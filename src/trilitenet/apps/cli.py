@@ -29,7 +29,7 @@ import cyclopts
 from cyclopts.exceptions import CycloptsError, UnknownOptionError, UnusedCliTokensError
 
 import trilitenet
-from trilitenet.errors import ConfigError, TriLiteNetError, did_you_mean
+from trilitenet.errors import ConfigError, OutputError, TriLiteNetError, did_you_mean
 
 __all__ = ["COMMANDS", "GROUPS", "Command", "build_app", "main"]
 
@@ -165,6 +165,7 @@ def main(words: Sequence[str] | None = None) -> int:
     Returns:
         The exit code.
     """
+    _open_closed_streams()
     # A lone "-" is standard input, not an option without a name.
     words = ["stdin" if word == "-" else word for word in (sys.argv[1:] if words is None else words)]
     level = os.environ.get("TRILITENET_LOG", "WARNING").upper()
@@ -179,12 +180,7 @@ def main(words: Sequence[str] | None = None) -> int:
         app = build_app(words)
         with _heeding_sigterm():
             result = app(words, print_error=False, exit_on_error=False, verbose=False, result_action="return_value")
-        try:
-            sys.stdout.write(_shown(result))
-            sys.stdout.flush()
-        finally:
-            for line in getattr(result, "errors", ()):
-                sys.stderr.write(f"error: {line}\n")
+        _show(result)
     except _MisuseError as error:
         return _fail(str(error), code=2)
     except CycloptsError as error:
@@ -202,7 +198,7 @@ def main(words: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _fail("interrupted", code=130)
     except BrokenPipeError:  # the reader, such as `head`, has gone
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_output()
     return int(getattr(result, "exit_code", 0))
 
 
@@ -266,9 +262,43 @@ def _one_line(error: CycloptsError) -> str:
     return f"{text.rstrip('.')} (see: {chain} --help)"
 
 
-def _shown(result: object) -> str:
+def _open_closed_streams() -> None:
+    """Put the null device where a standard stream is closed, or the next file that is opened would take its number.
+
+    Only what is written to it is lost in silence: standard input stays None.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(number)
+    if sys.stdout is None:
+        sys.stdout = open(1, "w", encoding="utf-8")  # noqa: SIM115 - a number; it stays open
+    if sys.stderr is None:
+        sys.stderr = open(2, "w", encoding="utf-8")  # noqa: SIM115
+
+
+def _show(result: object) -> None:
+    """Write what a command returned, and its errors.
+
+    Raises:
+        OutputError: If standard output takes no more.
+    """
     text = result.summary() if hasattr(result, "summary") else result
-    return f"{text}\n" if isinstance(text, str) and text else ""
+    try:
+        sys.stdout.write(f"{text}\n" if isinstance(text, str) and text else "")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        _discard_output()
+        raise OutputError(f"standard output: cannot be written ({error.strerror or error})") from error
+    finally:
+        for line in getattr(result, "errors", ()):
+            sys.stderr.write(f"error: {line}\n")
+
+
+def _discard_output() -> None:
+    """Let what standard output still holds go nowhere, or the end of the process would fail at it again."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _fail(message: str, code: int) -> int:

@@ -589,6 +589,8 @@ def _open_container(path: str, name: str, *, timeout: float | None = None) -> An
         InputError: If that fails; one line, with the name.
     """
     av = _av()
+    if path == "-" and sys.stdin is None:
+        raise InputError(f"{name}: is closed")
     options = {"rtsp_transport": "tcp"} if path.lower().startswith("rtsp") else {}
     if path != "-" and timeout is None and Path(path).is_file() and not Path(path).stat().st_size:
         raise InputError(f"{name}: is empty")
