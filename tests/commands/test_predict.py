@@ -134,6 +134,15 @@ def test_existing_results_are_refused_before_the_work_begins(
     assert (output / "other.jpg").read_text() == "kept"
 
 
+def test_a_run_that_predicts_nothing_replaces_nothing(folder: Path, tmp_path: Path, predictor: Predictor) -> None:
+    output, formats = tmp_path / "out", ("jsonl", "coco", "csv", "parquet", "scalabel")
+    assert predict_with(predictor, [folder / "photo.jpg"], output, format=formats).exit_code == 0
+    before = {path: path.read_bytes() for path in output.iterdir()}
+    report = predict_with(predictor, [folder / "text.txt"], output, format=formats, overwrite=True)
+    assert (report.images, report.exit_code) == (0, 1)
+    assert {path: path.read_bytes() for path in output.iterdir()} == before
+
+
 def test_a_source_is_never_overwritten(folder: Path, predictor: Predictor) -> None:
     before = (folder / "photo.jpg").read_bytes()
     with pytest.raises(OutputError, match="beside their source"):
@@ -285,7 +294,8 @@ from trilitenet.commands.predict import predict_with
 from trilitenet.errors import OutputError
 from trilitenet.inference.predictor import Predictor
 tries = [("drive.mp4", ()), ("a.png", ())]
-tries += [("a.png", (name,)) for name in ("json", "coco", "scalabel", "openlabel", "cvat", "yolo", "parquet")]
+formats = ("json", "coco", "scalabel", "openlabel", "cvat", "yolo", "parquet", "jsonl", "csv")
+tries += [("a.png", (name,)) for name in formats]
 for source, formats in tries:
     resource.setrlimit(resource.RLIMIT_FSIZE, (20 if formats else 50_000, 50_000))
     try:

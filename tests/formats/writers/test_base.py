@@ -5,6 +5,7 @@ import errno
 import importlib
 import json
 import signal
+import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
@@ -50,6 +51,18 @@ def test_no_writer_replaces_a_file_unasked(format_name: str, tmp_path: Path, pic
     with pytest.raises(OutputError, match="--overwrite"):
         write(overwrite=False)
     write(overwrite=True)
+
+
+def test_a_writer_that_is_given_nothing_replaces_nothing(
+    format_name: str, tmp_path: Path, pictures: list[Perception]
+) -> None:
+    with open_writer(format_name, tmp_path) as writer:
+        writer.write(pictures[0])
+    before = {path: path.read_bytes() for path in writer.files}
+    with open_writer(format_name, tmp_path, overwrite=True) as writer:
+        pass
+    assert writer.files == []
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
 def test_all_frames_of_a_video_go_into_the_same_files(format_name: str, tmp_path: Path) -> None:
@@ -175,3 +188,26 @@ def test_a_value_that_json_has_not_leaves_no_broken_file(name: str, tmp_path: Pa
             writer.write(dataclasses.replace(video[1], timestamp=float("nan")))
     (path,) = tmp_path.glob("*.json")
     assert json.loads(path.read_text())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the size of files is not limited there")
+@pytest.mark.parametrize("name", ["csv", "jsonl"])
+def test_a_full_disk_leaves_whole_frames_in_files_that_grow(name: str, tmp_path: Path, video: list[Perception]) -> None:
+    import resource
+
+    with open_writer(name, tmp_path) as writer:
+        for perception in video[:2]:
+            writer.write(perception)
+        before = {path: path.read_bytes() for path in writer.files}
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        smaller = min(map(len, before.values())) if name == "jsonl" else len(before[tmp_path / "boxes.csv"])
+        resource.setrlimit(resource.RLIMIT_FSIZE, (smaller + 20, limits[1]))
+        try:
+            with pytest.raises(OSError, match="File too large") as caught:
+                writer.write(video[2])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert Path(caught.value.filename) in writer.files
+        with pytest.raises(OutputError, match="gap"):
+            writer.write(video[2])
+    assert {path: path.read_bytes() for path in writer.files} == before

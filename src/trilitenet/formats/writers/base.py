@@ -7,7 +7,7 @@
 
 Memory stays flat over any number of frames, unless a format's own layout forbids it (said where it does). A file gets
 its final name when it is whole: until then it ends in ``.part``. JSON lines and CSV, which are whole after each line,
-have theirs from the beginning.
+have theirs from their first line on.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from __future__ import annotations
 import abc
 import contextlib
 import importlib
+import io
 import json
 import signal
 import threading
@@ -30,7 +31,7 @@ from trilitenet.structures import Perception
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["WRITERS", "JsonStream", "Writer", "find_writer", "open_writer", "uninterrupted"]
+__all__ = ["WRITERS", "GrowingFile", "JsonStream", "Writer", "find_writer", "open_writer", "uninterrupted"]
 
 WRITERS: Final[dict[str, str]] = {
     "json": "trilitenet.formats.writers.native:JsonWriter",
@@ -75,6 +76,7 @@ class Writer(abc.ABC):
         self._taken: set[str] = set()
         self._names: Counter[str] = Counter()
         self._unnamed = 0
+        self._empty = True
         self._broken = False
 
     def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
@@ -91,6 +93,7 @@ class Writer(abc.ABC):
         if self._broken:
             raise OutputError(f"{self.output}: a result could not be written, and what followed it would have a gap")
         with uninterrupted():
+            self._empty = False
             try:
                 self._write(perception, road)
             except OSError as error:
@@ -98,7 +101,10 @@ class Writer(abc.ABC):
                 raise
 
     def close(self) -> None:
-        """Finish every file, but none that a failed write may have left with a gap; a writer can be closed twice."""
+        """Finish every file, but none that a failed write may have left with a gap; a writer can be closed twice.
+
+        If nothing was written, files that exist stay as they are.
+        """
         with uninterrupted():
             self._close()
 
@@ -140,8 +146,11 @@ class Writer(abc.ABC):
         return path
 
     def finish(self, path: Path) -> None:
-        """Give a file that is whole its final name; after a failed write it goes, for it may have a gap."""
-        if self._broken:
+        """Give a file that is whole its final name; after a failed write it goes, for it may have a gap.
+
+        One without any result goes too where it would replace another.
+        """
+        if self._broken or (self._empty and path.exists()):
             part_of(path).unlink(missing_ok=True)
         else:
             part_of(path).replace(path)
@@ -236,6 +245,63 @@ def uninterrupted() -> Iterator[None]:
             signal.signal(number, handler)
         if held:
             before[held[0][0]](*held[0])
+
+
+class GrowingFile:
+    """A text file that is whole after each addition: one that cannot be written in full is taken back.
+
+    The first addition makes it, and replaces what is there.
+
+    Args:
+        path: The file; its folder exists.
+        files: Takes the path when the file is made.
+        head: Text before the first addition.
+    """
+
+    def __init__(self, path: Path, files: list[Path], head: str = "") -> None:
+        self.path = path
+        self._files = files
+        self._head = head
+        self._handle: io.FileIO | None = None
+        self._before = self._end = 0
+
+    def add(self, text: str) -> None:
+        """Write what belongs to one image or frame.
+
+        Raises:
+            OSError: If it cannot be written; it names the file, which takes nothing more.
+        """
+        try:
+            if self._handle is None:
+                self._handle = io.FileIO(self.path, "w")
+                self._files.append(self.path)
+                text = self._head + text
+            rest = text.encode()
+            self._before, self._end = self._end, self._end + len(rest)
+            while rest:
+                rest = rest[self._handle.write(rest) :]
+        except OSError as error:
+            self.take_back()
+            error.filename = str(self.path)
+            raise
+
+    def take_back(self) -> None:
+        """Forget the last addition, and with the first the file, and end it."""
+        if self._handle is None:
+            return
+        if self._before:
+            self._handle.truncate(self._before)
+        else:
+            self.path.unlink(missing_ok=True)
+            self._files.remove(self.path)
+        self._handle.close()
+
+    def close(self) -> None:
+        """End the file. Without any addition one that is there stays as it is, else it is made of the head alone."""
+        if self._handle is None and not self.path.exists():
+            self.add("")
+        if self._handle is not None:
+            self._handle.close()
 
 
 class JsonStream:

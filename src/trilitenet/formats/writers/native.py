@@ -6,9 +6,9 @@ import json
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
-from trilitenet.formats.writers.base import JsonStream, Writer, dumps
+from trilitenet.formats.writers.base import GrowingFile, JsonStream, Writer, dumps
 from trilitenet.processing.serialise import perception_to_dict
 from trilitenet.structures import SCHEMA_VERSION, Perception
 
@@ -81,14 +81,12 @@ class JsonLinesWriter(Writer):
 
     def __init__(self, output: Path, *, overwrite: bool = False) -> None:
         super().__init__(output, overwrite=overwrite)
-        path = self.create("perceptions.jsonl")
-        self._handle: IO[str] = path.open("w", encoding="utf-8", buffering=1)
-        self.files.append(path)
+        self._file = GrowingFile(self.create("perceptions.jsonl"), self.files)
 
     def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
         """Write one line."""
-        self._handle.write(f"{dumps(to_document(perception, road))}\n")
+        self._file.add(f"{dumps(to_document(perception, road))}\n")
 
     def _close(self) -> None:
         """Close the file."""
-        self._handle.close()
+        self._file.close()

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Any, Final
 
 from trilitenet.errors import import_extra, part_of
-from trilitenet.formats.writers.base import Writer, rounded
+from trilitenet.formats.writers.base import GrowingFile, Writer, rounded
 from trilitenet.processing.serialise import encode_mask
 from trilitenet.structures import SCHEMA_VERSION, Perception
 
@@ -110,25 +111,31 @@ class CsvWriter(Writer):
 
     def __init__(self, output: Path, *, overwrite: bool = False) -> None:
         super().__init__(output, overwrite=overwrite)
-        paths = [self.create("frames.csv"), self.create("boxes.csv")]
-        self._handles: list[IO[str]] = [path.open("w", encoding="utf-8", newline="", buffering=1) for path in paths]
-        self.files.extend(paths)
-        self._frames = csv.DictWriter(self._handles[0], list(FRAME_COLUMNS))
-        self._boxes = csv.DictWriter(self._handles[1], list(BOX_COLUMNS))
-        self._frames.writeheader()
-        self._boxes.writeheader()
+        self._frames, self._boxes = (
+            GrowingFile(self.create(file), self.files, _lines(columns, [{name: name for name in columns}]))
+            for file, columns in (("frames.csv", FRAME_COLUMNS), ("boxes.csv", BOX_COLUMNS))
+        )
 
     def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
         """Write the rows of one frame."""
-        self._frames.writerow(frame_row(perception, road))
         where = {"source": perception.source, "frame": perception.frame, "timestamp": perception.timestamp}
-        for row in box_rows(perception):
-            self._boxes.writerow({**where, **row})
+        self._frames.add(_lines(FRAME_COLUMNS, [frame_row(perception, road)]))
+        try:
+            self._boxes.add(_lines(BOX_COLUMNS, [{**where, **row} for row in box_rows(perception)]))
+        except OSError:
+            self._frames.take_back()
+            raise
 
     def _close(self) -> None:
         """Close the files."""
-        for handle in self._handles:
-            handle.close()
+        self._frames.close()
+        self._boxes.close()
+
+
+def _lines(columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> str:
+    text = io.StringIO()
+    csv.DictWriter(text, list(columns)).writerows(rows)
+    return text.getvalue()
 
 
 class ParquetWriter(Writer):
