@@ -194,6 +194,48 @@ def test_a_video_cut_short_gives_what_there_is(tmp_path: Path) -> None:
     assert 6 <= len(list(VideoReader(tmp_path / "a.ts"))) <= 12
 
 
+def noise(path: Path, frames: int = 40) -> Path:
+    """Write a video at 10 frames a second whose frames take the same space each, its index first."""
+    rng = np.random.default_rng(0)
+    with VideoWriter(path, 10) as writer:
+        for _ in range(frames):
+            writer.write(rng.integers(0, 256, (96, 160, 3), np.uint8))
+    return path
+
+
+@pytest.mark.parametrize("ending", ["mp4", "mkv", "avi"])
+def test_a_video_that_ends_before_its_length_is_told(
+    tmp_path: Path, ending: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole, cut = noise(tmp_path / "whole.mp4"), tmp_path / f"cut.{ending}"
+    if ending != "mp4":
+        with av.open(str(whole)) as plain, av.open(str(whole.with_suffix(f".{ending}")), "w") as container:
+            stream = container.add_stream("mpeg4", rate=10)
+            stream.width, stream.height, stream.bit_rate = 160, 96, 4_000_000
+            for frame in [*plain.decode(video=0), None]:
+                container.mux(stream.encode(frame))
+        whole = whole.with_suffix(f".{ending}")
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size * 2 // 3])
+    assert len(list(VideoReader(whole))) == 40
+    assert caplog.text == ""
+    assert len(list(VideoReader(cut, Clip(max_frames=5)))) == 5
+    assert caplog.text == ""
+    assert 5 < len(list(VideoReader(cut))) < 35
+    assert "s of 4.0 s; the file may be cut off" in caplog.text
+    assert "1 broken frames" not in caplog.text
+
+
+def test_a_file_behind_a_url_whose_connection_is_lost_is_an_error_after_what_came(tmp_path: Path) -> None:
+    data = noise(tmp_path / "a.mp4").read_bytes()
+    frames: list[Frame] = []
+    with Server([data[: len(data) * 2 // 3]] * 3, length=len(data)) as server:
+        (source,), _ = find_sources([server.url])
+        assert isinstance(source, VideoReader)
+        with pytest.raises(InputError, match=r"live\.ts: the connection was lost after \d\.\d s \("):
+            frames.extend(source)
+    assert 5 < len(frames) < 35
+
+
 def test_what_is_no_video_is_named(tmp_path: Path) -> None:
     good = video(tmp_path / "good.mp4").read_bytes()
     for name, data in {"text.mp4": b"not a video" * 100, "empty.mp4": b"", "cut.mp4": good[:600]}.items():
@@ -256,7 +298,7 @@ def test_a_piped_mp4_with_its_index_at_the_end_is_told_with_the_cure() -> None:
 class Server:
     """An HTTP server on this machine that sends one part a connection and hangs up; then refuses."""
 
-    def __init__(self, parts: list[bytes], *, length: bool = False) -> None:
+    def __init__(self, parts: list[bytes], *, length: int = 0) -> None:
         self.connections = 0
         outer = self
 
@@ -270,7 +312,7 @@ class Server:
                 self.send_response(200)
                 self.send_header("Content-Type", "video/mp2t")
                 if length:
-                    self.send_header("Content-Length", str(len(part)))
+                    self.send_header("Content-Length", str(length))
                 self.end_headers()
                 self.wfile.write(part)
 

@@ -99,6 +99,21 @@ def test_frames_of_a_file_are_batched_and_stay_in_order() -> None:
     assert all(perception.source == "scenes" for perception in perceptions)
 
 
+def test_frames_before_a_failure_are_seen_though_they_fill_no_batch() -> None:
+    class Lost(Scenes):
+        def _decode(self) -> Iterator[tuple[float, object]]:
+            yield from super()._decode()
+            raise InputError("scenes: lost")
+
+    perceptions: list[Perception | Failure] = []
+    with (
+        PerceptionStream(Lost(6), Predictor(ColourBackend(), batch_size=4)) as stream,
+        pytest.raises(InputError, match="lost"),
+    ):
+        perceptions.extend(stream)
+    assert len(perceptions) == 6
+
+
 def test_a_live_source_goes_one_by_one_and_never_piles_up() -> None:
     backend = ColourBackend()
     source = Scenes(60, live=True, pause=0.002)

@@ -62,6 +62,8 @@ _OFF_BEAT: Final = 0.25
 """Of a frame: a time stamp this far from all those that a constant rate would have is of a rate that varies."""
 _SLACK: Final = 1e-6
 """Seconds that a time stamp may be off by: a frame at 1/3 s is not before a start of 0.333333."""
+_WITH_LENGTH: Final = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "flv", "asf")
+"""FFmpeg's names of the containers that state their length, which of others is found from what is there."""
 _Decoded: TypeAlias = tuple[float, Callable[[], NDArray[np.uint8]]]
 """Seconds from the start, and what makes the RGB image of it (not called for frames that are left out)."""
 
@@ -268,7 +270,8 @@ class VideoReader(FrameReader):
             with self._open() as container:
                 yield from _frames_of(container, self)
         if self.broken:
-            _LOGGER.warning("%s: %d broken frames were left out", self.name, self.broken)
+            what = "frame was" if self.broken == 1 else "frames were"
+            _LOGGER.warning("%s: %d broken %s left out", self.name, self.broken, what)
 
     def _index(self, timestamp: float, count: int) -> int:
         if self._constant and self.rate:
@@ -607,23 +610,36 @@ def _open_container(path: str, name: str, *, timeout: float | None = None) -> An
 
 
 def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
-    """Yield the frames of the first video stream, those that cannot be decoded left out and counted."""
+    """Yield the frames of the first video stream, those that cannot be decoded left out and counted.
+
+    A file that ends well before its length is told in the log.
+
+    Raises:
+        InputError: If the connection to a stream, or to a file behind a URL, is lost.
+    """
     av = _av()
     stream = container.streams.video[0]
     step = 1 / (reader.rate or float(stream.average_rate or 0) or 30.0)
     first = float(stream.start_time * stream.time_base) if stream.start_time is not None else None
     last = -step
+    end = 0.0
     packets = container.demux(stream)
     while True:
         try:
             packet = next(packets)
         except StopIteration:
-            return
+            break
         except av.FFmpegError as error:  # the file ends in the middle, or the connection is lost
             if reader.live:
                 raise InputError(f"{reader.name}: the stream broke ({error.strerror})") from error
+            if "://" in reader.name and not isinstance(error, av.error.InvalidDataError):
+                reason = f"the connection was lost after {end:.1f} s ({error.strerror})"
+                raise InputError(f"{reader.name}: {reason}") from error
             reader.broken += 1
-            return
+            break
+        ticks = packet.dts if packet.pts is None else packet.pts
+        if ticks is not None:
+            end = max(end, float(ticks * packet.time_base) + (float((packet.duration or 0) * packet.time_base) or step))
         try:
             frames = packet.decode()
         except av.FFmpegError:
@@ -646,6 +662,12 @@ def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
             aspect = stream.sample_aspect_ratio or Fraction(1)
             reader.pixel_aspect = None if aspect == 1 else 1 / aspect if _orientation(frame)[2] else aspect
             yield timestamp, functools.partial(_upright, frame)
+    if not reader.live and container.format.name in _WITH_LENGTH:
+        length = float(stream.duration * stream.time_base) if stream.duration else (container.duration or 0) / 1e6
+        if container.format.name == "avi":  # from whose duration FFmpeg takes off what is not there
+            length = stream.frames * step
+        if length - end > max(0.02 * length, min(1, 5 * step)):
+            _LOGGER.warning("%s: ends after %.1f s of %.1f s; the file may be cut off", reader.name, end, length)
 
 
 def _upright(frame: Any) -> NDArray[np.uint8]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import queue
 import threading
 from collections import deque
@@ -160,15 +161,23 @@ def _perceive(
     """Yield a perception for each frame, in order; failures pass through.
 
     Raises:
-        InputError: If the predictor cannot take the frames of a video; a picture that it cannot take is a failure.
+        InputError: If the predictor cannot take the frames of a video, or they cannot be read to their end; a picture
+            that it cannot take is a failure.
     """
-    batch: list[Frame | Failure] = []
-    for item in items:
-        batch.append(item)
-        if len(batch) == batch_size:
-            yield from _perceive_batch(batch, predictor)
-            batch = []
-    yield from _perceive_batch(batch, predictor)
+    source = iter(items)
+    while True:
+        batch: list[Frame | Failure] = []
+        failure: InputError | None = None
+        try:
+            for item in itertools.islice(source, batch_size):
+                batch.append(item)
+        except InputError as error:  # what came before it is good
+            failure = error
+        yield from _perceive_batch(batch, predictor)
+        if failure is not None:
+            raise failure
+        if len(batch) < batch_size:
+            return
 
 
 def _perceive_batch(batch: Sequence[Frame | Failure], predictor: Predictor) -> Iterator[Perception | Failure]:
