@@ -58,8 +58,6 @@ _LOGGER: Final = logging.getLogger(__name__)
 _NUMBERED: Final = re.compile(r"%0?(\d*)d")
 _PATIENCE: Final = 10.0
 """Seconds without data after which a connection counts as broken."""
-_OFF_BEAT: Final = 0.25
-"""Of a frame: a time stamp this far from all those that a constant rate would have is of a rate that varies."""
 _SLACK: Final = 1e-6
 """Seconds that a time stamp may be off by: a frame at 1/3 s is not before a start of 0.333333."""
 _WITH_LENGTH: Final = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "flv", "asf")
@@ -213,8 +211,8 @@ class VideoReader(FrameReader):
     """A video file, or standard input, by PyAV.
 
     Rotation and mirroring noted in the file are applied, time stamps are the file's own (so that a variable frame rate
-    is kept), and a frame that cannot be decoded is left out and counted. Where the frame rate varies and the beginning
-    is skipped, the index is estimated by the mean rate.
+    is kept), and a frame that cannot be decoded is left out and counted. Frames that ``clip.start`` passes over
+    without reading them are not counted but estimated from the time and the mean rate.
 
     Args:
         path: The file, its URL, or ``"-"`` for standard input.
@@ -230,7 +228,6 @@ class VideoReader(FrameReader):
         super().__init__("stdin" if str(path) == "-" else _without_secrets(str(path)), clip)
         self._path = str(path)
         self._timeout = timeout
-        self._constant = False
         self._skipped = 0
         if self._path == "-":
             self._cure = "; an MP4 can be piped if its index comes first: ffmpeg -i IN -c copy -movflags +faststart OUT"
@@ -239,7 +236,6 @@ class VideoReader(FrameReader):
                 stream = container.streams.video[0]
                 rate = stream.average_rate or stream.guessed_rate
                 self.rate = float(rate) if rate else None
-                self._constant = bool(rate) and stream.average_rate == stream.base_rate
                 frames = stream.frames or None
                 if frames is None and container.duration and self.rate:
                     frames = round(container.duration / 1e6 * self.rate)
@@ -274,12 +270,6 @@ class VideoReader(FrameReader):
             _LOGGER.warning("%s: %d broken %s left out", self.name, self.broken, what)
 
     def _index(self, timestamp: float, count: int) -> int:
-        if self._constant and self.rate:
-            place = timestamp * self.rate
-            if abs(place - round(place)) < _OFF_BEAT:
-                self._skipped = round(place) - count
-                return round(place)
-            self._constant = False  # Matroska states a rate whatever its time stamps do
         return self._skipped + count
 
 
