@@ -274,6 +274,54 @@ def test_an_interruption_leaves_a_playable_video(tmp_path: Path, monkeypatch: py
     assert len(json.loads((tmp_path / "out" / "drive.json").read_text())["frames"]) == 5
 
 
+def test_an_interrupted_run_goes_on_where_it_was(
+    folder: Path, tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sources = [drive(tmp_path / f"{name}.mp4", frames=8) for name in ("a", "b", "c")]
+    output, formats = tmp_path / "out", ("json", "openlabel", "cvat")
+    taken = 0
+    write = VideoWriter.write
+
+    def interrupted(self: VideoWriter, image: np.ndarray, timestamp: float | None = None) -> None:
+        nonlocal taken
+        taken += 1
+        if taken == 12:
+            raise KeyboardInterrupt
+        write(self, image, timestamp)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(VideoWriter, "write", interrupted)
+        assert predict_with(predictor, sources, output, format=formats).interrupted
+    files = {f"{name}.{ending}" for name in "abc" for ending in ("mp4", "json", "openlabel.json", "cvat-video.xml")}
+    there = {path.name for path in output.iterdir()}
+    assert there == {name for name in files if name[0] != "c"} | {"b.unfinished.part"}
+    before = {path: path.stat().st_mtime_ns for path in output.glob("a.*")}
+    report = predict_with(predictor, sources, output, format=formats, skip_existing=True)
+    assert (report.videos, report.frames, report.skipped, report.exit_code) == (2, 16, 1, 0)
+    assert report.summary().endswith("; 1 skipped, done already")
+    assert {path: path.stat().st_mtime_ns for path in output.glob("a.*")} == before
+    assert {path.name for path in output.iterdir()} == files
+    assert len(json.loads((output / "b.json").read_text())["frames"]) == 8
+    (output / "c.mp4").unlink()
+    report = predict_with(predictor, sources, output, format=formats, skip_existing=True)
+    assert (report.videos, report.skipped) == (1, 2)
+    pictures = [folder / "photo.jpg", folder / "grey.png"]
+    assert predict_with(predictor, pictures[:1], tmp_path / "two").images == 1
+    report = predict_with(predictor, pictures, tmp_path / "two", skip_existing=True)
+    assert (report.images, report.skipped) == (1, 1)
+
+
+@pytest.mark.parametrize("format", ["jsonl", "csv", "coco", "yolo", "cvat"])
+def test_results_of_several_sources_in_one_file_cannot_be_skipped(
+    format: str, folder: Path, tmp_path: Path, predictor: Predictor
+) -> None:
+    with pytest.raises(ConfigError, match=f"--skip-existing needs .* and {format} has one "):
+        predict_with(predictor, [folder], tmp_path / "out", format=("json", format), skip_existing=True)
+    with pytest.raises(ConfigError, match="exclude each other"):
+        predict_with(predictor, [folder], tmp_path / "out", skip_existing=True, overwrite=True)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_failing_backend_is_an_error_and_no_thread_hangs(tmp_path: Path) -> None:
     predictor = Predictor(ColourBackend(fail_after=2), batch_size=2)
     with pytest.raises(BackendError, match="as it was told to"):

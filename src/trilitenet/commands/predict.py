@@ -9,7 +9,7 @@ import logging
 import os
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path, PurePath
 from typing import Final
 
@@ -26,10 +26,12 @@ from trilitenet.commands.paths import text_paths
 from trilitenet.errors import (
     LONGEST_NAME,
     BackendError,
+    ConfigError,
     InputError,
     OutputError,
     ShapeError,
     free_name,
+    part_of,
     replacing,
     writing,
 )
@@ -99,6 +101,7 @@ class PredictReport:
         files: The overlays written.
         output: The folder of all results.
         interrupted: Whether it was stopped by Ctrl-C; what was written until then is whole.
+        skipped: Sources that were left out because their results exist.
     """
 
     images: int
@@ -109,6 +112,7 @@ class PredictReport:
     files: tuple[Path, ...]
     output: Path
     interrupted: bool = False
+    skipped: int = 0
 
     @property
     def exit_code(self) -> int:
@@ -131,8 +135,9 @@ class PredictReport:
             )
         speed = (self.images + self.frames) / max(self.seconds, 1e-9)
         what = f"{', '.join(done)} at {speed:.1f} a second -> {self.output}" if done else "nothing was predicted"
+        skipped = f"; {self.skipped} skipped, done already" if self.skipped else ""
         failed = f"; {len(self.failures)} failed" if self.failures else ""
-        return f"{'interrupted: ' if self.interrupted else ''}{what}{failed}"
+        return f"{'interrupted: ' if self.interrupted else ''}{what}{skipped}{failed}"
 
 
 @text_paths
@@ -147,6 +152,7 @@ def predict(
     overlay: bool = True,
     hide: tuple[str, ...] = (),
     overwrite: bool = False,
+    skip_existing: bool = False,
     every: int = 1,
     start: float = 0.0,
     end: float | None = None,
@@ -179,6 +185,8 @@ def predict(
         hide: Parts of the overlay to leave out: drivable, lane, boxes, labels; with --road also lines, distances, above
             (the picture from above), status.
         overwrite: Replace results that exist.
+        skip_existing: Leave out sources whose results all exist, and do the others anew, as after an interruption; for
+            overlays and formats with a file for each source.
         every: Of a video, take every so many frames.
         start: Of a video, begin at so many seconds.
         end: Of a video, stop at so many seconds.
@@ -198,13 +206,16 @@ def predict(
         What was done.
 
     Raises:
+        ConfigError: If an option is out of range, or not possible beside another.
         OutputError: If results exist and may not be replaced (told before the work begins), or cannot be written.
     """
     options = RoadOptions(road, camera, track, smoothing)
     check_parts(hide, PARTS + ROAD_PARTS)
     options.open(still=False)  # what is wrong with them is told before any work
     clip = Clip(every=every, start=start, end=end, max_frames=max_frames)
-    job = _Job(sources, output, clip, format, overlay=overlay, overwrite=overwrite, rate=rate)
+    job = _Job(
+        sources, output, clip, format, overlay=overlay, overwrite=overwrite, skip_existing=skip_existing, rate=rate
+    )
     with load(
         model,
         device=device,
@@ -227,6 +238,7 @@ def predict_with(
     overlay: bool = True,
     hide: Sequence[str] = (),
     overwrite: bool = False,
+    skip_existing: bool = False,
     rate: float = 30.0,
     preview: bool = False,
     quiet: bool = True,
@@ -243,13 +255,23 @@ def predict_with(
         overlay: As for `predict`.
         hide: As for `predict`.
         overwrite: As for `predict`.
+        skip_existing: As for `predict`.
         rate: As for `predict`.
         preview: As for `predict`.
         quiet: As for `predict`.
         road: What is wanted beyond the single frame.
     """
     check_parts(hide, PARTS + ROAD_PARTS)
-    job = _Job(sources, output, clip or Clip(), format, overlay=overlay, overwrite=overwrite, rate=rate)
+    job = _Job(
+        sources,
+        output,
+        clip or Clip(),
+        format,
+        overlay=overlay,
+        overwrite=overwrite,
+        skip_existing=skip_existing,
+        rate=rate,
+    )
     return job.run(predictor, hide=hide, preview=preview, quiet=quiet, road=road)
 
 
@@ -265,8 +287,11 @@ class _Job:
         *,
         overlay: bool,
         overwrite: bool,
+        skip_existing: bool,
         rate: float,
     ) -> None:
+        if overwrite and skip_existing:
+            raise ConfigError("--skip-existing and --overwrite exclude each other; choose one")
         if not sources:
             raise InputError("no source was given: name a picture, a folder, a video, a URL or a camera's number")
         self.output = output
@@ -274,31 +299,89 @@ class _Job:
         self.clip = clip
         self.sources, self.failures = find_sources(sources, clip, rate=rate)
         self.formats = tuple(dict.fromkeys(formats))
-        self.overwrite = overwrite
+        self.overwrite = overwrite or skip_existing  # then what exists is of a source that is done anew
         self.names = [name for source in self.sources for name in _names(source)]
         self.stems = _allot_stems(self.names)
         self._leave_out_long_names()
+        self.skipped = self._leave_out_done() if skip_existing else 0
         self._check_output()
         self._check_formats()
         self.writers: list[Writer] = []
         self.images = self.videos = self.frames = 0
         self.files: list[Path] = []
+        self.unfinished: dict[str, bool] = {}
 
     def _leave_out_long_names(self) -> None:
         """Make a source whose results would have longer names than file systems take a failure of its own."""
-        sources: list[Stills | FrameReader] = []
+        fitting: set[str] = set()
         for source in self.sources:
             patterns = [pattern for name in self.formats for pattern in _patterns(find_writer(name), source)]
             endings = [PurePath(pattern).name.replace("*", "0000000").format("") for pattern in patterns]
             longest = max(map(len, [".jpg", *endings]))
-            fitting = {name for name in _names(source) if len(os.fsencode(self.stems[name])) + longest <= LONGEST_NAME}
             reason = "its name is too long for the names of its results; rename it"
-            self.failures += [Failure(name, f"{name}: {reason}") for name in _names(source) if name not in fitting]
+            for name in _names(source):
+                if len(os.fsencode(self.stems[name])) + longest <= LONGEST_NAME:
+                    fitting.add(name)
+                else:
+                    self.failures.append(Failure(name, f"{name}: {reason}"))
+        self._keep(fitting)
+
+    def _leave_out_done(self) -> int:
+        """Leave out the sources whose results are all there and whole, and return how many.
+
+        Raises:
+            ConfigError: If a format gathers several sources in one file.
+        """
+        for name in self.formats:
+            writer = find_writer(name)
+            patterns = {pattern for source in self.sources for pattern in _patterns(writer, source)}
+            for pattern in (*writer.FILES, *sorted(patterns)):
+                if "{}" not in pattern:
+                    raise ConfigError(
+                        f"--skip-existing needs formats with a file for each source, and {name} has one {pattern} for "
+                        "all; choose another --format, or --overwrite"
+                    )
+        left = {
+            name
+            for source in self.sources
+            for name in _names(source)
+            if self._mark(name).exists() or not all(path.exists() for path in self._files(source, name))
+        }
+        before = sum(len(_names(source)) for source in self.sources)
+        self._keep(left)
+        return before - len(left)
+
+    def _keep(self, names: Collection[str]) -> None:
+        """Leave out the sources, and the pictures among them, of other names."""
+        sources: list[Stills | FrameReader] = []
+        for source in self.sources:
             if isinstance(source, Stills):
-                source = Stills(tuple(path for path in source.paths if str(path) in fitting))
-            if fitting:
+                source = Stills(tuple(path for path in source.paths if str(path) in names))
+            if any(name in names for name in _names(source)):
                 sources.append(source)
         self.sources = sources
+
+    def _files(self, source: Stills | FrameReader, name: str) -> list[Path]:
+        """Return the files that are a source's alone."""
+        patterns = [pattern for each in self.formats for pattern in _patterns(find_writer(each), source)]
+        if self.overlay:
+            patterns.append("{}.jpg" if isinstance(source, Stills) else "{}.mp4")
+        return [self.output / pattern.format(self.stems[name]) for pattern in patterns]
+
+    def _mark(self, name: str) -> Path:
+        """Return the file that is there while the results of a video are not of all its frames."""
+        return part_of(self.output / f"{self.stems[name]}.unfinished")
+
+    def _mark_unfinished(self) -> None:
+        """Leave a mark beside the results of a video that was not done to its end, and remove those of others."""
+        for source in self.sources:
+            if isinstance(source, FrameReader) and source.name in self.unfinished:
+                mark = self._mark(source.name)
+                with writing(mark):
+                    if self.unfinished[source.name] and any(map(Path.exists, self._files(source, source.name))):
+                        mark.touch()
+                    else:
+                        mark.unlink(missing_ok=True)
 
     def _check_output(self) -> None:
         if self.output.exists() and not self.output.is_dir():
@@ -359,6 +442,7 @@ class _Job:
         interrupted = False
         with contextlib.ExitStack() as stack:
             stack.enter_context(writing(self.output))
+            stack.callback(self._mark_unfinished)  # once all files have their names
             if self.sources:
                 self.output.mkdir(parents=True, exist_ok=True)
                 for name in self.formats:
@@ -385,6 +469,7 @@ class _Job:
             files=tuple(self.files),
             output=self.output,
             interrupted=interrupted,
+            skipped=self.skipped,
         )
 
     def _run_source(
@@ -423,8 +508,12 @@ class _Job:
                                 raise InputError(f"{source.name}: {error}") from error
                             self.failures.append(Failure(str(item.source), f"{item.source}: {error}"))
                         else:
+                            if isinstance(source, FrameReader):
+                                self.unfinished[source.name] = True
                             self._take(perception, road, video, hide, window)
                     progress.advance(task)
+                if isinstance(source, FrameReader):
+                    self.unfinished[source.name] = False
             except InputError as error:
                 assert isinstance(source, FrameReader)
                 self.failures.append(Failure(source.name, str(error)))
