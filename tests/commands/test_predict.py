@@ -252,26 +252,33 @@ def test_a_broken_video_among_good_sources(tmp_path: Path, predictor: Predictor)
     assert {Path(failure.source).name for failure in report.failures} == {"broken.mp4", "empty.mp4"}
 
 
-def test_an_interruption_leaves_a_playable_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_leaves_a_playable_video_of_the_frames_in_the_other_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
     predictor = Predictor(ColourBackend(), batch_size=1)
     written = 0
     write = VideoWriter.write
 
     def interrupted(self: VideoWriter, image: np.ndarray, timestamp: float | None = None) -> None:
         nonlocal written
-        if written == 5:
-            raise KeyboardInterrupt
         written += 1
+        if written == 6:
+            signal.raise_signal(number)
         write(self, image, timestamp)
 
     source = drive(tmp_path / "drive.mp4", frames=40)
     monkeypatch.setattr(VideoWriter, "write", interrupted)
-    report = predict_with(predictor, [source, source], tmp_path / "out")
+    before = signal.signal(number, signal.default_int_handler)
+    try:
+        report = predict_with(predictor, [source, source], tmp_path / "out")
+    finally:
+        signal.signal(number, before)
     assert report.interrupted
     assert report.exit_code == 130
-    assert report.summary().startswith("interrupted: 1 video of 5 frames")
-    assert len(list(VideoReader(tmp_path / "out" / "drive.mp4"))) == 5
-    assert len(json.loads((tmp_path / "out" / "drive.json").read_text())["frames"]) == 5
+    assert report.summary().startswith("interrupted: 1 video of 6 frames")
+    assert len(list(VideoReader(tmp_path / "out" / "drive.mp4"))) == 6
+    assert len(json.loads((tmp_path / "out" / "drive.json").read_text())["frames"]) == 6
 
 
 def test_an_interrupted_run_goes_on_where_it_was(

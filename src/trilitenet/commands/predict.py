@@ -35,7 +35,7 @@ from trilitenet.errors import (
     replacing,
     writing,
 )
-from trilitenet.formats.writers.base import Writer, find_writer, open_writer
+from trilitenet.formats.writers.base import Writer, find_writer, open_writer, uninterrupted
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, Failure, FrameReader, Stills, find_sources
 from trilitenet.inference.video import PerceptionStream, VideoWriter
@@ -530,8 +530,16 @@ class _Job:
         hide: Sequence[str],
         window: _Window | None,
     ) -> None:
-        """Draw and write one perception."""
-        if self.overlay or window is not None:
+        """Write and draw one perception; an interruption waits, so that no result is a frame ahead of another."""
+        with uninterrupted():
+            for writer in self.writers:
+                writer.write(perception, None if road is None else road.to_dict())
+            if perception.frame is None:
+                self.images += 1
+            else:
+                self.frames += 1
+            if not self.overlay and window is None:
+                return
             assert perception.image is not None
             # The frame is ours alone from here on: drawing on it saves a copy.
             picture = draw(perception, hide=[part for part in hide if part in PARTS], out=perception.image)
@@ -544,14 +552,8 @@ class _Job:
                 path = self.output / f"{self.stems[perception.source]}.jpg"
                 _write_jpeg(path, picture)
                 self.files.append(path)
-            if window is not None:
-                window.show(picture)
-        for writer in self.writers:
-            writer.write(perception, None if road is None else road.to_dict())
-        if perception.frame is None:
-            self.images += 1
-        else:
-            self.frames += 1
+        if window is not None:
+            window.show(picture)
 
 
 def _follow(perception: Perception, parts: tuple[Steady | None, RoadMonitor | None]) -> tuple[Perception, Road | None]:
