@@ -1,12 +1,12 @@
 from __future__ import annotations
 
 import inspect
-import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 
@@ -35,10 +35,8 @@ def greet(monkeypatch: pytest.MonkeyPatch) -> list[object]:
         calls.append((name, loudness))
         if name == "nobody":
             raise OutputError("nobody: cannot be greeted")
-        if name == "ctrl-c":
-            raise KeyboardInterrupt
-        if name == "sigterm":
-            os.kill(os.getpid(), signal.SIGTERM)
+        if name in {"ctrl-c", "sigterm"}:
+            signal.raise_signal(signal.SIGTERM if name == "sigterm" else signal.SIGINT)
             calls.append("not reached")
         return Done() if name == "two" else f"hello {name}"
 
@@ -71,13 +69,31 @@ def test_an_error_is_one_line(greet: list[object], capsys: pytest.CaptureFixture
     assert captured.out == ""
 
 
+@pytest.fixture
+def handlers() -> Iterator[dict[signal.Signals, Any]]:
+    """Python's own handlers of what interrupts, put back at the end."""
+    plain: dict[signal.Signals, Any] = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in plain.items()}
+    yield plain
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.mark.parametrize("name", ["ctrl-c", "sigterm"])
-def test_an_interruption_is_130(greet: list[object], name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    before = signal.getsignal(signal.SIGTERM)
+def test_an_interruption_is_130_and_a_second_one_is_ignored(
+    greet: list[object], name: str, capsys: pytest.CaptureFixture[str], handlers: dict[signal.Signals, Any]
+) -> None:
     assert cli.main(["greet", name]) == 130
     assert capsys.readouterr().err == "error: interrupted\n"
     assert greet == [(name, 1)]
-    assert signal.getsignal(signal.SIGTERM) == before
+    assert {number: signal.getsignal(number) for number in handlers} == dict.fromkeys(handlers, signal.SIG_IGN)
+
+
+def test_without_an_interruption_signals_are_handled_as_before(
+    greet: list[object], handlers: dict[signal.Signals, Any]
+) -> None:
+    assert cli.main(["greet", "Ada"]) == 0
+    assert {number: signal.getsignal(number) for number in handlers} == handlers
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ called: ``trilitenet --help`` reads the summaries from the sources and loads nei
 
 What a command returns is shown by its ``summary()`` (or as it is, if it is text), followed by its ``errors``, and ends
 with ``exit_code`` where it has one. Exit codes: 0 done; 1 an error, told in one line; 2 a wrong command line; 130
-interrupted, by Ctrl-C or SIGTERM.
+interrupted, by Ctrl-C or SIGTERM, of which the process then ignores further ones.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ def main(words: Sequence[str] | None = None) -> int:
         _check_command(words)
         words = _repeated(words)
         app = build_app(words)
-        with _heeding_sigterm():
+        with _interruptible():
             result = app(words, print_error=False, exit_on_error=False, verbose=False, result_action="return_value")
         _show(result)
     except _MisuseError as error:
@@ -203,23 +203,38 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def _heeding_sigterm() -> Iterator[None]:
-    """Let SIGTERM interrupt as Ctrl-C does: what is half done is finished or taken back before the process ends."""
+def _interruptible() -> Iterator[None]:
+    """Let SIGTERM interrupt as Ctrl-C does: what is half done is finished or taken back before the process ends.
+
+    After the first of them the process ignores both to its end, or a second one would cut that short.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     process = os.getpid()
+    before = {signal.SIGTERM: signal.getsignal(signal.SIGTERM)}
+    if callable(signal.getsignal(signal.SIGINT)):  # a shell's background job ignores it
+        before[signal.SIGINT] = signal.getsignal(signal.SIGINT)
+    interrupted = False
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        if os.getpid() != process:  # a fork: whoever started it ends it so
+        nonlocal interrupted
+        if os.getpid() == process:
+            interrupted = True
+            for each in before:
+                signal.signal(each, signal.SIG_IGN)
+        elif number == signal.SIGTERM:  # a fork: whoever started it ends it so
             os._exit(128 + number)
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    for each in before:
+        signal.signal(each, interrupt)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        if not interrupted:
+            for each, handler in before.items():
+                signal.signal(each, handler)
 
 
 class _MisuseError(Exception):
