@@ -107,6 +107,8 @@ def test_errors() -> None:
         Predictor(ColourBackend())("absent.jpg")
     with pytest.raises(ConfigError, match="at least 1"):
         Predictor(ColourBackend(), batch_size=0)
+    with pytest.raises(ConfigError, match="long_side must be at most 16384, got 100000"):
+        Predictor(ColourBackend(), long_side=100_000)
 
 
 def test_it_closes_its_backend() -> None:

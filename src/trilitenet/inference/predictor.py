@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeAlias, overload
+from typing import Any, Final, TypeAlias, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ __all__ = ["ImageLike", "Predictor"]
 
 ImageLike: TypeAlias = str | Path | bytes | Image.Image | NDArray[Any]
 """A path, the bytes of an image file, a Pillow image, or a (height, width, 3) uint8 **RGB** array."""
+
+_LONGEST_SIDE: Final = 16384
+"""Pixels of the longer side at most: beyond, one image takes more memory than machines have."""
 
 
 class Predictor:
@@ -42,7 +45,8 @@ class Predictor:
         batch_size: At most so many images go through the network at once.
 
     Raises:
-        ConfigError: If a size is not positive, or the backend's file fixes thresholds inside and others are asked for.
+        ConfigError: If a size is not positive, or ``long_side`` above 16384, or the backend's file fixes thresholds
+            inside and others are asked for.
     """
 
     def __init__(
@@ -56,6 +60,8 @@ class Predictor:
         long_side = max(backend.card.input_size) if long_side is None else long_side
         if min(long_side, batch_size) < 1:
             raise ConfigError(f"long_side and batch_size must be at least 1, got {long_side} and {batch_size}")
+        if long_side > _LONGEST_SIDE:
+            raise ConfigError(f"long_side must be at most {_LONGEST_SIDE}, got {long_side}")
         self.backend = backend
         self.thresholds = thresholds or backend.card.thresholds
         self._check_thresholds()
