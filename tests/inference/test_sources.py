@@ -423,6 +423,8 @@ def test_numbered_pictures_are_a_video(tmp_path: Path) -> None:
         SequenceReader(str(tmp_path / "other_%04d.png"))
     with pytest.raises(ConfigError, match="must be above 0"):
         SequenceReader(str(tmp_path / "img_%04d.png"), rate=0)
+    with pytest.raises(ConfigError, match="must be above 0"):
+        find_sources([tmp_path / "img_0003.png"], rate=0)
 
 
 def test_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:

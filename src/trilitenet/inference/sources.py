@@ -394,8 +394,7 @@ class SequenceReader(FrameReader):
             raise ConfigError(f"{pattern}: a pattern of numbered pictures has one %d, such as frames/%06d.jpg")
         before, after = pattern[: place.start()], pattern[place.end() :]
         digits = int(place.group(1) or 1)
-        if not 0 < rate <= 1000:
-            raise ConfigError(f"the frame rate must be above 0 and at most 1000, got {rate}")
+        _check_rate(rate)
         super().__init__(before.rstrip("/\\_-. ") or "sequence", clip)
         self.rate = rate
         exact = re.compile(rf"{re.escape(before)}(\d{{{digits},}}){re.escape(after)}\Z")
@@ -454,7 +453,11 @@ def find_sources(
     Returns:
         The sources in order, each once, neighbouring pictures together, no two readers of one name; and what cannot be
         used.
+
+    Raises:
+        ConfigError: If the rate is out of range.
     """
+    _check_rate(rate)
     sources: list[Stills | FrameReader] = []
     failures: list[Failure] = []
     stills: list[Path] = []
@@ -503,6 +506,11 @@ def find_sources(
         sources.append(Stills(tuple(stills)))
     _tell_apart(source for source in sources if isinstance(source, FrameReader))
     return sources, failures
+
+
+def _check_rate(rate: float) -> None:
+    if not 0 < rate <= 1000:
+        raise ConfigError(f"the frame rate must be above 0 and at most 1000, got {rate}")
 
 
 def _tell_apart(readers: Iterable[FrameReader]) -> None:

@@ -81,7 +81,9 @@ def test_mistakes_are_told_in_one_line(started: list[Any], tmp_path: Path, capsy
             (["--token-file", str(binary)], "holds no token (it is not text)"),
             (["--token-file", str(foreign)], "must be plain ASCII"),
             (["--queue", "0"], "queue must be at least 1"),
-            (["--deadline", "-1"], "deadline must be positive"),
+            (["--deadline", "-1"], "deadline must be positive and finite"),
+            (["--drain", "-1"], "drain must be at least 0 and finite"),
+            (["--max-batch", "-1"], "max_batch must be at least 0"),
             (["--port", port], f"cannot listen on 127.0.0.1 port {port} (Address already in use); choose"),
             (["--port", "99999"], "cannot listen"),
             (["--host", ""], "0.0.0.0 lets other machines in"),
@@ -105,7 +107,7 @@ def test_settings_must_fit_each_other() -> None:
 @pytest.mark.parametrize("name", ["deadline", "drain", "batch_delay", "upload_timeout"])
 @pytest.mark.parametrize("value", [float("inf"), float("nan")])
 def test_every_limit_is_finite(name: str, value: float) -> None:
-    with pytest.raises(ConfigError, match=f"{name} must be positive and finite"):
+    with pytest.raises(ConfigError, match=f"{name} must be (positive|at least 0) and finite"):
         Settings(**{name: value})  # type: ignore[arg-type]
 
 

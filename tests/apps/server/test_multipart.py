@@ -53,7 +53,10 @@ def test_a_part_without_a_name_is_kept_without_one() -> None:
 def test_too_many_parts_are_refused() -> None:
     with pytest.raises(ProblemError) as caught:
         split_form(_part("image", b"1") * 3 + b"--xyz--", TYPE, 2)
-    assert caught.value.status == 413
+    assert (caught.value.status, caught.value.message) == (413, "the form has more than 2 parts")
+    with pytest.raises(ProblemError) as caught:
+        split_form(_part("image", b"1") * 2 + b"--xyz--", TYPE, 1)
+    assert caught.value.message == "the form has more than 1 part"
 
 
 @pytest.mark.parametrize("filler", [b"\r", b"\r\n", b"\r\n--xy", b"-"])

@@ -77,6 +77,8 @@ def serve(
 
     if log_level not in {"debug", "info", "warning", "error"}:
         raise ConfigError(f"log_level must be debug, info, warning or error, got {log_level!r}")
+    if max_batch < 0:
+        raise ConfigError(f"max_batch must be at least 0, got {max_batch}")
     settings = Settings(
         queue=queue,
         max_batch=max_batch or Settings.max_batch,

@@ -52,7 +52,8 @@ def split_form(body: bytes, content_type: str, max_parts: int) -> list[Part]:
     parts: list[Part] = []
     while body[position : position + 2] != b"--":
         if len(parts) == max_parts:
-            raise ProblemError(413, "too_many_parts", f"the form has more than {max_parts} parts")
+            most = f"{max_parts} part{'s' * (max_parts != 1)}"
+            raise ProblemError(413, "too_many_parts", f"the form has more than {most}")
         end = body.find(delimiter, position)
         # The search starts at the delimiter's own line break, so that a part without headers is found.
         headers_end = body.find(b"\r\n\r\n", position, position + _MAX_HEADERS)

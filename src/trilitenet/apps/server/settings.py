@@ -73,7 +73,8 @@ class Settings:
             if field.type == "int" and value < lowest:
                 raise ConfigError(f"{field.name} must be at least {lowest}, got {value}")
             if field.type == "float" and not (0 < value < math.inf or (lowest == 0 and value == 0)):
-                raise ConfigError(f"{field.name} must be positive and finite, got {value}")
+                allowed = "positive" if lowest else "at least 0"
+                raise ConfigError(f"{field.name} must be {allowed} and finite, got {value}")
         needed = 2 * self.max_body + BYTES_PER_PIXEL * self.max_pixels
         if needed > self.memory:
             raise ConfigError(
