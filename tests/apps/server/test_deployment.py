@@ -69,6 +69,7 @@ def test_the_kubernetes_manifest_is_valid_and_safe() -> None:
     assert container["securityContext"]["readOnlyRootFilesystem"] is True
     assert container["readinessProbe"]["httpGet"]["path"] == container["startupProbe"]["httpGet"]["path"] == "/readyz"
     assert container["livenessProbe"]["httpGet"]["path"] == "/healthz"
+    assert container["imagePullPolicy"] == "IfNotPresent"
     drain = float(container["args"][container["args"].index("--drain") + 1])
     assert pod["terminationGracePeriodSeconds"] > drain + 30
 
