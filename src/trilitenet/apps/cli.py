@@ -29,7 +29,7 @@ import cyclopts
 from cyclopts.exceptions import CycloptsError, UnknownOptionError, UnusedCliTokensError
 
 import trilitenet
-from trilitenet.errors import ConfigError, OutputError, TriLiteNetError, did_you_mean
+from trilitenet.errors import ConfigError, OutputError, TriLiteNetError, did_you_mean, needing_torch
 
 __all__ = ["COMMANDS", "GROUPS", "Command", "build_app", "main"]
 
@@ -177,9 +177,10 @@ def main(words: Sequence[str] | None = None) -> int:
             raise ConfigError(f"TRILITENET_LOG={level} is no level of a log; take DEBUG, INFO, WARNING or ERROR")
         _check_command(words)
         words = _repeated(words)
-        app = build_app(words)
-        with _interruptible():
-            result = app(words, print_error=False, exit_on_error=False, verbose=False, result_action="return_value")
+        with needing_torch():
+            app = build_app(words)
+            with _interruptible():
+                result = app(words, print_error=False, exit_on_error=False, verbose=False, result_action="return_value")
         _show(result)
     except _MisuseError as error:
         return _fail(str(error), code=2)
@@ -187,14 +188,6 @@ def main(words: Sequence[str] | None = None) -> int:
         return _fail(_one_line(error), code=2)
     except TriLiteNetError as error:
         return _fail(str(error), code=1)
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "torch":
-            raise
-        return _fail(
-            "this needs PyTorch, which is not installed: pip install 'torch>=2.4,<2.14'; "
-            "without it, exported files run on ONNX Runtime, OpenVINO and NCNN",
-            code=1,
-        )
     except KeyboardInterrupt:
         return _fail("interrupted", code=130)
     except BrokenPipeError:  # the reader, such as `head`, has gone

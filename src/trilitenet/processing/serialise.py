@@ -76,7 +76,7 @@ def perception_to_dict(perception: Perception) -> dict[str, Any]:
     if boxes is not None and not (np.isfinite(boxes.xyxy).all() and np.isfinite(boxes.confidence).all()):
         raise ShapeError("boxes hold numbers that are not finite, which JSON cannot say")
     if moment is not None and not math.isfinite(moment):
-        raise ShapeError(f"timestamp must be finite seconds, got {moment}")
+        raise ShapeError(f"timestamp {moment} is not finite, which JSON cannot say")
     return {
         "schema": SCHEMA_VERSION,
         "source": None if perception.source is None else str(perception.source),
