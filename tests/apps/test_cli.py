@@ -81,18 +81,24 @@ def handlers() -> Iterator[dict[signal.Signals, Any]]:
 
 @pytest.mark.parametrize("name", ["ctrl-c", "sigterm"])
 def test_an_interruption_is_130_and_a_second_one_is_ignored(
-    greet: list[object], name: str, capsys: pytest.CaptureFixture[str], handlers: dict[signal.Signals, Any]
+    greet: list[object],
+    name: str,
+    capsys: pytest.CaptureFixture[str],
+    handlers: dict[signal.Signals, Any],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert cli.main(["greet", name]) == 130
+    monkeypatch.setattr(sys, "argv", ["trilitenet", "greet", name])
+    assert cli.main() == 130
     assert capsys.readouterr().err == "error: interrupted\n"
     assert greet == [(name, 1)]
     assert {number: signal.getsignal(number) for number in handlers} == dict.fromkeys(handlers, signal.SIG_IGN)
 
 
-def test_without_an_interruption_signals_are_handled_as_before(
-    greet: list[object], handlers: dict[signal.Signals, Any]
+@pytest.mark.parametrize(("name", "code"), [("Ada", 0), ("ctrl-c", 130)])
+def test_a_program_that_goes_on_handles_signals_as_before(
+    greet: list[object], name: str, code: int, handlers: dict[signal.Signals, Any]
 ) -> None:
-    assert cli.main(["greet", "Ada"]) == 0
+    assert cli.main(["greet", name]) == code
     assert {number: signal.getsignal(number) for number in handlers} == handlers
 
 

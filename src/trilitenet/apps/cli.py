@@ -166,6 +166,7 @@ def main(words: Sequence[str] | None = None) -> int:
         The exit code.
     """
     _open_closed_streams()
+    ends = words is None  # with this function, the process
     # A lone "-" is standard input, not an option without a name.
     words = ["stdin" if word == "-" else word for word in (sys.argv[1:] if words is None else words)]
     level = os.environ.get("TRILITENET_LOG", "WARNING").upper()
@@ -179,7 +180,7 @@ def main(words: Sequence[str] | None = None) -> int:
         words = _repeated(words)
         with needing_torch():
             app = build_app(words)
-            with _interruptible():
+            with _interruptible(ends):
                 result = app(words, print_error=False, exit_on_error=False, verbose=False, result_action="return_value")
         _show(result)
     except _MisuseError as error:
@@ -196,10 +197,11 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def _interruptible() -> Iterator[None]:
+def _interruptible(ends: bool) -> Iterator[None]:
     """Let SIGTERM interrupt as Ctrl-C does: what is half done is finished or taken back before the process ends.
 
-    After the first of them the process ignores both to its end, or a second one would cut that short.
+    After the first of them both are ignored, or a second one would cut that short; to the end of the process if it
+    ``ends`` with the command.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -225,7 +227,7 @@ def _interruptible() -> Iterator[None]:
     try:
         yield
     finally:
-        if not interrupted:
+        if not (interrupted and ends):
             for each, handler in before.items():
                 signal.signal(each, handler)
 
