@@ -241,6 +241,7 @@ def test_several_values_may_follow_one_option() -> None:
         ("data convert --lane-width train=8 4 A B", "data convert --lane-width train=8 --lane-width 4 A B"),
         ("evaluate --by scene weather tiny", "evaluate --by scene --by weather tiny"),
         ("export --format onnx tiny", "export --format onnx tiny"),
+        ("train --tasks detection lane r.yaml", "train --tasks detection --tasks lane r.yaml"),
     ],
 )
 def test_no_second_value_is_taken_for_a_file(words: str, spread: str) -> None:

@@ -96,6 +96,8 @@ def test_what_would_be_ignored_is_refused(tmp_path: Path) -> None:
         benchmark(table="cost", plot=tmp_path / "a.png")
     with pytest.raises(ConfigError, match="--plot must end in"):
         benchmark(plot=tmp_path / "a.xyz")
+    with pytest.raises(ConfigError, match="--output and --plot are one file"):
+        benchmark(output=tmp_path / "a.png", plot=tmp_path / "a.png")
     with pytest.raises(ConfigError, match="--source must be at least 1x1, got -5x100"):
         benchmark(stage="frame", source=(-5, 100))
 

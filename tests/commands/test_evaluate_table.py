@@ -42,6 +42,8 @@ def test_options_that_do_not_fit(tmp_path: Path) -> None:
         evaluate_table("tiny", data=tmp_path, output=tmp_path, precisions=())
     with pytest.raises(ConfigError, match="--calibration-frames must be at least 1, got 0"):
         evaluate_table("tiny", data=tmp_path, output=tmp_path, calibration_frames=0)
+    with pytest.raises(ConfigError, match=r"--max-drop must be points, not negative and finite, got -1"):
+        evaluate_table("tiny", data=tmp_path, output=tmp_path, precisions=("fp32", "int8"), max_drop=-1.0)
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match=r"file/precisions\.md: cannot be written \(.*file is no folder\)$"):
         evaluate_table("tiny", data=tmp_path, output=tmp_path / "file")

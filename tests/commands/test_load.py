@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import trilitenet
 from tests.artefacts import Artefacts
@@ -53,6 +54,15 @@ def test_a_runtime_that_weights_do_not_run_on_tells_its_export(backend: str, for
 def test_counts_below_one_are_refused_before_a_runtime_sees_them(options: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match="streams and threads must be at least 1"):
         trilitenet.load("no.ncnn.param", threads=options.get("threads"), streams=options.get("streams", 1))
+
+
+def test_threads_are_those_of_pytorch_too(weights: Path) -> None:
+    before = torch.get_num_threads()
+    try:
+        trilitenet.load(weights, device="cpu", threads=before + 1)
+        assert torch.get_num_threads() == before + 1
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_mistakes_are_named(weights: Path) -> None:

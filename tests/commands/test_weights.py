@@ -90,6 +90,11 @@ def test_a_card_text_with_an_unknown_key_is_refused_before_the_work(scenes: Path
     assert not (tmp_path / "out.safetensors").exists()
 
 
+def test_finished_weights_are_called_what_is_loaded_as_weights(scenes: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"out\.txt: weights end with \.safetensors"):
+        finish("tiny", tmp_path / "out.txt", data=scenes)
+
+
 @pytest.mark.parametrize("size", [(100, 160), (0, 160), (-32, 64)])
 def test_an_input_size_that_the_network_cannot_take_is_refused(
     scenes: Path, tmp_path: Path, size: tuple[int, int]

@@ -15,7 +15,7 @@ from trilitenet.engine.evaluate import evaluate
 from trilitenet.engine.figures import FIGURES
 from trilitenet.engine.page import percent
 from trilitenet.engine.published_rows import PUBLISHED_ROWS
-from trilitenet.engine.report import Report, read_report
+from trilitenet.engine.report import SAVED, Report, read_report
 from trilitenet.engine.robustness import CORRUPTED, corrupted_figures, figures_by_size
 from trilitenet.errors import ConfigError, DataError, OutputError
 from trilitenet.processing.letterbox import Letterbox
@@ -133,11 +133,17 @@ def test_reports_of_other_images_or_labels_are_not_paired(report: Report) -> Non
     batches = dataclasses.replace(report, provenance=dataclasses.replace(report.provenance, settings=settings))
     fair = report.state["fair"]
     renamed = {**report.state, "fair": {**fair, "detection": {**fair["detection"], "class_names": ["lorry"]}}}
+    saved = dataclasses.replace(report, provenance=dataclasses.replace(report.provenance, runtime=SAVED))
     comparison = compare_reports(
-        {"a": report, "b": batches, "c": dataclasses.replace(report, state=renamed)}, resamples=10
+        {"a": report, "b": batches, "c": dataclasses.replace(report, state=renamed), "d": saved}, resamples=10
     )
     assert "batches of 3" in comparison.unpaired["b"]
     assert "tells lorry" in comparison.unpaired["c"]
+    assert "saved predictions" in comparison.unpaired["d"]
+    for name in ("b", "d"):
+        assert comparison.difference(name, "fair/drivable/iou") is not None
+        assert comparison.difference(name, "paper/drivable/miou") is None
+        assert f"{name}: {comparison.unpaired[name]}" in " ".join(comparison.summary().split())
     with pytest.raises(ConfigError, match="at least one"):
         compare_reports({})
 

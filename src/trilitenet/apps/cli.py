@@ -134,9 +134,11 @@ _LISTS: Final = {
     "--hide": "drivable|lane|boxes|labels|lines|distances|above|status",
     "--lane-width": r"([\w*.-]+=)?\d+(\.\d+)?",
     "--precisions": "fp32|fp16|bf16|int8",
+    "--loggers": "csv|tensorboard|mlflow|wandb",
     "--resolution": r"\d+",
     "--severities": r"\d+",
     "--splits": r"(train|val|valid|validation|test)([-_.]\w+)?",
+    "--tasks": "detection|drivable|lane",
     "--where": r"[\w.-]+=.+",
 }
 """Options that take several values, and what a value looks like, so that no file or model is taken for one."""

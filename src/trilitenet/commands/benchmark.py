@@ -161,7 +161,7 @@ def benchmark(
         source: Height and width of the image for --stage frame.
         device: auto, cpu, cuda.
         streams: Images OpenVINO computes at once; use with --batch of as many or more.
-        threads: Threads of ONNX Runtime, OpenVINO or NCNN.
+        threads: Threads of every runtime; their own choice if left out.
         output: JSON file to write.
         plot: Picture (.png, .svg) of the distributions to write.
 
@@ -186,6 +186,8 @@ def benchmark(
         raise ConfigError("--table cost is of the three variants, and nothing is timed; leave models and --plot out")
     if plot is not None and plot.suffix.lower() not in _PLOTS:
         raise ConfigError(f"{plot}: --plot must end in {', '.join(_PLOTS)}")
+    if output is not None and output == plot:
+        raise ConfigError(f"{plot}: --output and --plot are one file; give two names")
     for file in (output, plot):
         if file is not None:
             check_writable(file)

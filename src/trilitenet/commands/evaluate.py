@@ -92,7 +92,7 @@ def evaluate(
         ConfigError: If a count is negative, or an artefact has decided already what a protocol decides.
         OutputError: If there is a report already.
     """
-    check_counts(resamples, worst, limit)
+    check_counts(resamples, worst, limit, paper_batch)
     check_output(output, overwrite)
     predictor = load(
         model,
@@ -235,7 +235,7 @@ def known_report(folder: Path, model: str, data_hash: dict[str, str]) -> Report 
     return report if same else None
 
 
-def check_counts(resamples: int, worst: int = 0, limit: int | None = None) -> None:
+def check_counts(resamples: int, worst: int = 0, limit: int | None = None, paper_batch: int = 1) -> None:
     """Refuse, before hours of work, counts that are negative, and a limit of no images.
 
     Raises:
@@ -244,6 +244,8 @@ def check_counts(resamples: int, worst: int = 0, limit: int | None = None) -> No
     for option, value in (("resamples", resamples), ("worst", worst)):
         if value < 0:
             raise ConfigError(f"--{option} must not be negative, got {value}; 0 is for none")
+    if paper_batch < 1:
+        raise ConfigError(f"--paper-batch must be at least 1, got {paper_batch}")
     if limit is not None and limit < 1:
         raise ConfigError(f"--limit must be at least 1, got {limit}; leave it out for all images")
 

@@ -13,6 +13,7 @@ from trilitenet.commands.evaluate import evaluate, hash_dataset, hash_model, kno
 from trilitenet.commands.export import (
     PRECISIONS,
     Precision,
+    check_drop,
     drop_frames,
     export,
     find_pictures,
@@ -158,6 +159,7 @@ def evaluate_table(
         raise ConfigError("int8 needs a fixed --size; give one, or leave int8 out of --precisions")
     if calibration_frames < 1:
         raise ConfigError(f"--calibration-frames must be at least 1, got {calibration_frames}")
+    check_drop(max_drop)
     check_writable(output / "precisions.md")
     int8 = ""
     if "int8" in precisions:
@@ -173,10 +175,12 @@ def evaluate_table(
         for precision in precisions:
             name = f"{Path(model).stem}-{stamp}-{size}-{precision}{int8 if precision == 'int8' else ''}"
             artefact = output / f"{name}{ARTEFACT_SUFFIXES[format]}"
-            known = not overwrite and artefact.is_file()
-            report = known_report(output / name, str(artefact), hashes[classes]) if known else None
+            folder = output / (name if format == "openvino" else f"{name}-{format}")
+            files = [artefact, *([artefact.with_suffix(".bin")] if format == "openvino" else [])]
+            made = not overwrite and all(file.is_file() for file in files)
+            report = known_report(folder, str(artefact), hashes[classes]) if made else None
             if report is None:
-                if overwrite or not artefact.exists():
+                if not made:
                     export(
                         model,
                         format=format,
@@ -188,7 +192,7 @@ def evaluate_table(
                         max_drop=max_drop if precision == "int8" else None,
                         masks="probability",  # the protocols decide by thresholds of their own
                         frames=data,
-                        overwrite=overwrite,
+                        overwrite=True,
                     )
                 report = evaluate(
                     str(artefact),
@@ -196,7 +200,7 @@ def evaluate_table(
                     split=split,
                     protocol="both",
                     backend="openvino" if format == "openvino" else "onnxruntime",
-                    output=output / name,
+                    output=folder,
                     resamples=0,
                     worst=0,
                     limit=limit,

@@ -249,6 +249,7 @@ def _check_options(
         raise ConfigError(f"--calibration-frames must be at least 1, got {calibration_frames}")
     if max_drop is not None and precision != "int8":
         raise ConfigError("--max-drop is for --precision int8")
+    check_drop(max_drop)
     if max_drop is not None and nms:
         raise ConfigError("--max-drop measures the boxes that --nms drops; find what to keep without --nms")
     if portable and layout not in ("auto", "planar"):
@@ -259,6 +260,16 @@ def _check_options(
         raise ConfigError(
             f"masks of ncnn, tensorrt and --portable are logits; give --masks logit or leave it out, not {masks}"
         )
+
+
+def check_drop(max_drop: float | None) -> None:
+    """Refuse points that a precision may lose that are no such number.
+
+    Raises:
+        ConfigError: If they are negative, or not finite.
+    """
+    if max_drop is not None and not 0 <= max_drop < math.inf:
+        raise ConfigError(f"--max-drop must be points, not negative and finite, got {max_drop}")
 
 
 def _destination(model: str, format: Format, output: Path | None) -> Path:

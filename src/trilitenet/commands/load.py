@@ -59,7 +59,7 @@ def load(
         long_side: The longer side of an image is resized to so many pixels; by default as in training.
         batch_size: At most so many images go through the network at once.
         streams: Images that OpenVINO computes at once: more frames a second, more latency.
-        threads: Threads of ONNX Runtime, OpenVINO or NCNN; their own choice if left out.
+        threads: Threads of the runtime; its own choice if left out. PyTorch has one number for the whole process.
 
     Returns:
         The predictor.
@@ -116,6 +116,10 @@ def _open(model: str | os.PathLike[str], device: str, backend: str, streams: int
         from trilitenet.inference.tensorrt_backend import TensorRTBackend
 
         return TensorRTBackend(model)
+    if threads is not None:
+        import torch
+
+        torch.set_num_threads(threads)
     if suffix == ".pt2":
         from trilitenet.inference.exported_torch_backend import ExportedTorchBackend
 

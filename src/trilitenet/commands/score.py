@@ -61,7 +61,7 @@ def score(
         ConfigError: If a count is negative, or the confidence out of range.
         OutputError: If there is a report already.
     """
-    check_counts(resamples, worst, limit)
+    check_counts(resamples, worst, limit, paper_batch)
     if not 0 <= confidence <= 1:
         raise ConfigError(f"--confidence must be in [0, 1], got {confidence}")
     check_output(output, overwrite)

@@ -99,6 +99,8 @@ def finish(
         ConfigError: If the input size is not of multiples of 32, or the batch size below 1.
         OutputError: If the destination exists already, or cannot be written.
     """
+    if destination.suffix != ".safetensors":
+        raise ConfigError(f"{destination}: weights end with .safetensors")
     if destination.exists() and not overwrite:
         raise OutputError(f"{destination}: exists already; give another name or --overwrite")
     if input_size is not None:

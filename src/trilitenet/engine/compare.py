@@ -18,7 +18,7 @@ from rich.text import Text
 from trilitenet.engine.figures import HEADLINES, meaning
 from trilitenet.engine.page import escape, interval_plot, page, percent, section, table
 from trilitenet.engine.published_rows import PUBLISHED_ROWS, PublishedRow
-from trilitenet.engine.report import Report, render
+from trilitenet.engine.report import SAVED, Report, render
 from trilitenet.errors import ConfigError, write_file
 from trilitenet.metrics.bootstrap import bootstrap, interval
 
@@ -59,7 +59,7 @@ class Comparison:
         data: Where each was measured.
         figures: Name -> figure key -> value.
         differences: Of every other model to the first; none for those measured on other images.
-        unpaired: Name -> why its differences cannot be told.
+        unpaired: Name -> why its differences, or some of them, cannot be told.
         confidence: Name -> the confidence that precision, recall and F1 of boxes are stated at.
         published: Published rows beside them.
         resamples: Bootstrap draws.
@@ -156,12 +156,15 @@ def compare_reports(
     unpaired: dict[str, str] = {}
     for name in names[1:]:
         other = reports[name]
-        reason = _why_unpaired(first, other)
+        reason, published_alone = _why_unpaired(first, other), _why_published_unpaired(first, other)
+        if reason or published_alone:
+            unpaired[name] = reason or published_alone
         if reason:
-            unpaired[name] = reason
             continue
         spread = _spread(other, resamples, seed)
         for key, figure in other.figures.items():
+            if published_alone and key.startswith("paper/"):
+                continue
             if key in first.figures and key in spread and key in base:
                 low, high = interval(spread[key] - base[key])
                 value = figure.value - first.figures[key].value
@@ -200,12 +203,22 @@ def _why_unpaired(first: Report, other: Report) -> str:
     for part, value in first.provenance.data_sha256.items():
         if other.provenance.data_sha256.get(part, value) != value:
             return f"measured with other {part} under the same names; no paired differences"
-    batches = [report.provenance.settings.get("paper_batch") for report in (first, other)]
-    if None not in batches and batches[0] != batches[1]:
-        return f"published averages over batches of {batches[1]}, the first of {batches[0]}; no paired differences"
     classes = [report.state.get("fair", {}).get("detection", {}).get("class_names") for report in (first, other)]
     if None not in classes and classes[0] != classes[1]:
         return f"tells {', '.join(classes[1])}, the first {', '.join(classes[0])}; no paired differences"
+    return ""
+
+
+def _why_published_unpaired(first: Report, other: Report) -> str:
+    """Say why the figures of the published protocol alone cannot be compared; empty if they can."""
+    batches = [report.provenance.settings.get("paper_batch") for report in (first, other)]
+    if None not in batches and batches[0] != batches[1]:
+        return (
+            f"averages over batches of {batches[1]}, the first of {batches[0]}; no paired differences of paper figures"
+        )
+    saved = [report.provenance.runtime == SAVED for report in (first, other)]
+    if saved[0] != saved[1] and "paper" in first.state and "paper" in other.state:
+        return "one was scored from saved predictions, the other not; no paired differences of paper figures"
     return ""
 
 
@@ -281,6 +294,11 @@ def _comparison_page(comparison: Comparison) -> str:
         plots.append(f'<div class="card"><h3>{escape(name)} less {escape(names[0])}, points</h3>{body}</div>')
     if note := comparison.confidence_note():
         plots.append(f'<p class="note">{escape(note)}</p>')
+    plots += [
+        f'<p class="note">{escape(f"{name}: {reason}")}</p>'
+        for name, reason in comparison.unpaired.items()
+        if any(one.model == name for one in comparison.differences)
+    ]
     if plots:
         parts.append(section("Which differences are real", f'<div class="grid">{"".join(plots)}</div>'))
     parts.append(section("Every figure", f'<div class="card">{_page_figures(comparison)}</div>', "Per cent."))

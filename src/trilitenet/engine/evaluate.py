@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from trilitenet.config import ModelCard, Task, Thresholds
 from trilitenet.engine.predictions import SavedPredictions
 from trilitenet.engine.provenance import describe_hardware, describe_versions, peak_memory
-from trilitenet.engine.report import Provenance, Report
+from trilitenet.engine.report import SAVED, Provenance, Report
 from trilitenet.engine.scorecard import CONDITIONS, PAPER_THRESHOLDS, Scorecard, protocols_of
 from trilitenet.engine.scoring import CanvasPrediction, LabelledImage, add_boxes
 from trilitenet.errors import ConfigError, DataError
@@ -258,7 +258,7 @@ def score_predictions(
             started,
             {
                 "model": str(predictions.folder),
-                "runtime": "saved predictions",
+                "runtime": SAVED,
                 "thresholds": {"confidence": confidence},
                 "canvas": tuple(f"{width}x{height}" for height, width in canvases),
                 "settings": _settings(protocols, paper_batch, resamples, seed),

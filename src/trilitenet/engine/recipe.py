@@ -181,6 +181,14 @@ class TrainConfig:
         for name in ("task_weights", "box_gains", "drivable_tversky", "lane_tversky", "focal", "distillation"):
             if not all(0 <= value < math.inf for value in getattr(self, name)):
                 raise ConfigError(f"{name} must not hold negative or infinite numbers, got {getattr(self, name)}")
+        if self.focal[0] > 1:
+            raise ConfigError(f"focal must be alpha in [0, 1] and gamma, got {self.focal}")
+        if not self.tasks or len(set(self.tasks)) < len(self.tasks):
+            raise ConfigError(f"tasks must be some of {', '.join(TASKS)}, each once, got {list(self.tasks)}")
+        if self.classes is not None and not 0 < len(self.classes) == len(set(self.classes)):
+            raise ConfigError(
+                f"classes must be names, each once, got {list(self.classes)}; leave them out for the data's"
+            )
         if not 0 <= self.teacher_confidence[0] <= self.teacher_confidence[1] <= 1:
             raise ConfigError(
                 f"teacher_confidence must be two numbers in [0, 1], the lower first, got {self.teacher_confidence}"

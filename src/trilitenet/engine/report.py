@@ -25,6 +25,7 @@ from trilitenet.errors import DataError, brief, write_file
 __all__ = [
     "FEW_IMAGES",
     "REPORT_SCHEMA",
+    "SAVED",
     "Condition",
     "DetectionPlots",
     "Figure",
@@ -37,6 +38,7 @@ __all__ = [
 
 REPORT_SCHEMA: Final = 1
 """Version of the JSON; a file with a higher one is refused. docs/evaluation.md describes it."""
+SAVED: Final = "saved predictions"
 FEW_IMAGES: Final = 30
 """A table cell from fewer images says little and is greyed."""
 
@@ -146,7 +148,7 @@ class Provenance:
     Attributes:
         model: File, name or folder of predictions.
         model_sha256: Of the file; None where there is none.
-        runtime: Runtime and device.
+        runtime: Runtime and device; `SAVED` of predictions that were read.
         data: Where the images are.
         split: Their split.
         images: How many.

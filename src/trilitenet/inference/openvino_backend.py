@@ -78,6 +78,8 @@ class OpenVINOBackend:
             model = core.read_model(path)
         except RuntimeError as error:
             reason = " ".join(str(error).split())[:160]
+            if "is_valid_weights_range" in str(error):
+                reason = f"{weights.name} is cut off, or of another file; export it again"
             raise WeightsError(f"{path}: not a usable OpenVINO or ONNX model ({reason})") from error
         self._card, self.info = read_metadata(_metadata(model), str(path))
         if path.suffix.lower() == ".onnx" and self.info.precision == "int8":
