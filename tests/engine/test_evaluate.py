@@ -287,6 +287,21 @@ def test_a_backend_that_runs_in_parallel_changes_no_figure() -> None:
     assert backend.inside == 0
 
 
+def test_progress_is_told_image_by_image(tmp_path: Path) -> None:
+    images = Images(4)
+    told: list[tuple[int, int]] = []
+
+    def progress(done: int, total: int) -> None:
+        told.append((done, total))
+
+    evaluate(fake_predictor(images), images, resamples=0, progress=progress)
+    best_thresholds(fake_predictor(images), images, limit=3, progress=progress)
+    (tmp_path / "detections.json").write_text("[]")
+    saved = SavedPredictions(tmp_path, ("vehicle",))
+    score_predictions(saved, images, limit=2, resamples=0, progress=progress)
+    assert told == [*((n, 4) for n in (1, 2, 3, 4)), *((n, 3) for n in (1, 2, 3)), (1, 2), (2, 2)]
+
+
 def test_the_worst_images_are_the_worst_of_all() -> None:
     images = Images()
     few, every = (

@@ -177,7 +177,7 @@ def test_corruptions_are_measured_and_averaged() -> None:
     clean = evaluate(predictor, images, resamples=0)
     passes: list[str] = []
     rows = corrupted_figures(
-        predictor, images, clean, corruptions=("contrast", "pixelate"), severities=(1, 5), progress=passes.append
+        predictor, images, clean, corruptions=("contrast", "pixelate"), severities=(1, 5), on_pass=passes.append
     )
     assert passes == ["contrast 1", "contrast 5", "pixelate 1", "pixelate 5"]
     shown = {row.name: row.figures for row in rows if not row.detail}

@@ -7,17 +7,17 @@ import dataclasses
 import io
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import cv2
 from cyclopts import Parameter
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from trilitenet.commands.paths import text_paths
+from trilitenet.commands.progress import show_progress
 from trilitenet.data.check_page import check_page, picture_page
 from trilitenet.data.checking import KINDS, CheckReport, check_dataset, detect_layout
 from trilitenet.data.contact_sheet import contact_sheet, draw_sample, pick
@@ -40,8 +40,6 @@ from trilitenet.processing.cores import usable_cores
 from trilitenet.processing.letterbox import Letterbox
 
 __all__ = ["Checked", "Converted", "Prepared", "Shown", "check", "convert", "prepare", "show"]
-
-Progressed = Callable[[int, int], None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,7 +160,7 @@ def convert(
     description = DatasetDescription(
         name=mapping.name or out.name, licence=mapping.licence, source=f"{chosen}: {Path(raw).name}"
     )
-    with _progress("images") as advance:
+    with show_progress("images") as advance:
         report = run_conversion(
             records,
             out,
@@ -244,7 +242,7 @@ def check(
         DataError: If the layout is not the published one.
         MissingExtraError: If the extra ``data`` is not installed.
     """
-    with _progress("images") as advance:
+    with show_progress("images") as advance:
         report = check_dataset(root, workers=_workers(workers), progress=advance)
     files: list[Path] = []
     if json_file is not None:
@@ -404,7 +402,7 @@ def prepare(
         DataError: If the data set is broken.
         OutputError: If the output holds something else, or was made with other settings.
     """
-    with _progress("images") as advance:
+    with show_progress("images") as advance:
         counts = run_preparation(
             root,
             output,
@@ -518,11 +516,3 @@ def _rendered(table: Table) -> str:
     text = io.StringIO()
     Console(file=text, width=140).print(table)
     return text.getvalue().rstrip()
-
-
-@contextlib.contextmanager
-def _progress(what: str) -> Iterator[Progressed]:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(what, total=None)
-        yield lambda done, total: progress.update(task, completed=done, total=total)

@@ -12,6 +12,7 @@ from typing import Any, Final, Literal
 
 from trilitenet.commands.load import load
 from trilitenet.commands.paths import check_writable, text_paths
+from trilitenet.commands.progress import show_progress
 from trilitenet.config import ArtefactInfo, Task, shipped_weights
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.evaluate import EvaluatedPredictor
@@ -112,6 +113,7 @@ def evaluate(
         writer = None
         if save is not None:
             writer = stack.enter_context(PredictionWriter(save, predictor.card.tasks, overwrite=overwrite))
+        shown = stack.enter_context(show_progress("images"))
         report = run_evaluation(
             predictor,
             dataset,
@@ -123,6 +125,7 @@ def evaluate(
             by=by,
             paper_batch=paper_batch,
             on_prediction=None if writer is None else lambda sample, prediction: writer.write(sample.name, prediction),
+            progress=shown,
             about={
                 "model": model,
                 "model_sha256": hash_model(model),
@@ -137,10 +140,14 @@ def evaluate(
             "batch_size": batch_size,
             "limit": limit,
             "paper_batch": paper_batch,
+            "progress": shown,
         }
         if corruptions:
-            variations += corrupted_figures(predictor, dataset, report, severities=severities, **settings)
+            variations += corrupted_figures(
+                predictor, dataset, report, severities=severities, on_pass=shown.name, **settings
+            )
         if resolution:
+            shown.name("input sizes")
             variations += figures_by_size(_resized(predictor, resolution), dataset, **settings)
         report = dataclasses.replace(report, variations=tuple(variations))
     write_report(report, output)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Literal
@@ -20,7 +21,7 @@ from trilitenet.commands.export import (
 )
 from trilitenet.commands.paths import check_writable, text_paths
 from trilitenet.commands.tables import PAPER_COLUMNS, markdown_row
-from trilitenet.config import ARTEFACT_SUFFIXES
+from trilitenet.config import ARTEFACT_SUFFIXES, VARIANTS
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.provenance import hash_files
 from trilitenet.errors import ConfigError, write_file
@@ -167,7 +168,7 @@ def evaluate_table(
         int8 += "" if max_drop is None else f"-drop{max_drop:g}"
     rows: list[PrecisionRow] = []
     hashes: dict[tuple[str, ...], dict[str, str]] = {}  # the classes decide what labels mean
-    for model in models or ("tiny", "small", "base"):
+    for model in models or VARIANTS:
         classes = read_card(model).class_names
         if classes not in hashes:
             hashes[classes] = hash_dataset(DrivingDataset(data, split, class_names=classes), limit)
@@ -180,7 +181,9 @@ def evaluate_table(
             made = not overwrite and all(file.is_file() for file in files)
             report = known_report(folder, str(artefact), hashes[classes]) if made else None
             if report is None:
+                stage = f"{model} {precision} ({len(rows) + 1} of {len(models or VARIANTS) * len(precisions)})"
                 if not made:
+                    sys.stderr.write(f"{stage}: exporting\n")
                     export(
                         model,
                         format=format,
@@ -194,6 +197,7 @@ def evaluate_table(
                         frames=data,
                         overwrite=True,
                     )
+                sys.stderr.write(f"{stage}: measuring\n")
                 report = evaluate(
                     str(artefact),
                     data=data,

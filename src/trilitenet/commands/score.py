@@ -8,6 +8,7 @@ from typing import Literal
 
 from trilitenet.commands.evaluate import check_counts, check_output, hash_dataset, warn_of_foreign, write_report
 from trilitenet.commands.paths import text_paths
+from trilitenet.commands.progress import show_progress
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.evaluate import score_predictions
 from trilitenet.engine.predictions import DETECTIONS_FILE, SavedPredictions
@@ -69,30 +70,32 @@ def score(
     saved = SavedPredictions(predictions, classes)
     if "detection" in saved.tasks:
         warn_of_foreign(dataset)
-    report = score_predictions(
-        saved,
-        dataset,
-        protocol=protocol,
-        confidence=confidence,
-        limit=limit,
-        resamples=resamples,
-        worst=worst,
-        by=by,
-        paper_batch=paper_batch,
-        about={
-            "model": str(predictions),
-            "model_sha256": hash_files(
-                [predictions / DETECTIONS_FILE]
-                + [
-                    predictions / task / f"{name}.png"
-                    for task in ("drivable", "lane")
-                    for name in dataset.names[:limit]
-                ]
-            ),
-            "data": str(data),
-            "split": split,
-            "data_sha256": hash_dataset(dataset, limit),
-        },
-    )
+    with show_progress("images") as shown:
+        report = score_predictions(
+            saved,
+            dataset,
+            protocol=protocol,
+            confidence=confidence,
+            limit=limit,
+            resamples=resamples,
+            worst=worst,
+            by=by,
+            paper_batch=paper_batch,
+            progress=shown,
+            about={
+                "model": str(predictions),
+                "model_sha256": hash_files(
+                    [predictions / DETECTIONS_FILE]
+                    + [
+                        predictions / task / f"{name}.png"
+                        for task in ("drivable", "lane")
+                        for name in dataset.names[:limit]
+                    ]
+                ),
+                "data": str(data),
+                "split": split,
+                "data_sha256": hash_dataset(dataset, limit),
+            },
+        )
     write_report(report, output)
     return report

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from trilitenet.commands.load import load
 from trilitenet.commands.paths import text_paths
+from trilitenet.commands.progress import show_progress
 from trilitenet.config import ModelCard, check_size, parse, read_yaml
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.evaluate import best_thresholds
@@ -118,10 +119,11 @@ def finish(
     try:
         # Measured as stored: what the user loads is what the figures are of.
         save_network(network, draft, dataclasses.replace(described, metrics={}), half=not full)
-        with load(draft) as predictor:
-            best = best_thresholds(predictor, dataset, batch_size=batch_size)
+        with load(draft) as predictor, show_progress("thresholds") as shown:
+            best = best_thresholds(predictor, dataset, batch_size=batch_size, progress=shown)
             predictor.thresholds = best.thresholds
-            report = run_evaluation(predictor, dataset, batch_size=batch_size, resamples=0, worst=0)
+            shown.name("figures")
+            report = run_evaluation(predictor, dataset, batch_size=batch_size, resamples=0, worst=0, progress=shown)
         figures = {f"{split} {name}": round(figure.value, 4) for name, figure in report.figures.items()}
         finished = dataclasses.replace(described, thresholds=best.thresholds, metrics=figures)
         save_network(network, destination, finished, half=not full)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import datetime
+import itertools
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -117,6 +118,7 @@ def evaluate(
     paper_batch: int = 16,
     change: ImageChange | None = None,
     on_prediction: Callable[[LabelledImage, Perception], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
     about: Mapping[str, Any] | None = None,
 ) -> Report:
     """Score a predictor on labelled images.
@@ -134,6 +136,7 @@ def evaluate(
         paper_batch: Images a batch of the published averages.
         change: Alters each image before the network sees it (corruptions); labels stay.
         on_prediction: Called with every image and its prediction in pixels of the image, in order.
+        progress: Called with how many images are scored, and of how many.
         about: Fields of `Provenance` that only the caller knows: ``model``, ``model_sha256``, ``data``, ``split``,
             ``data_sha256``, ``settings``.
 
@@ -155,9 +158,13 @@ def evaluate(
     )
     started = time.time()
     canvases: dict[tuple[int, int], None] = {}
+    count = len(dataset) if limit is None else min(limit, len(dataset))
+    done = itertools.count(1)
 
     def score(sample: LabelledImage, prediction: Prediction) -> None:
         scorecard.add(sample, *prediction)
+        if progress is not None:
+            progress(next(done), count)
         if on_prediction is not None and prediction[0] is not None:
             on_prediction(sample, prediction[0])
 
@@ -200,6 +207,7 @@ def score_predictions(
     worst: int = 24,
     by: Sequence[str] = CONDITIONS,
     paper_batch: int = 16,
+    progress: Callable[[int, int], None] | None = None,
     about: Mapping[str, Any] | None = None,
 ) -> Report:
     """Score saved predictions of any model, by the lines that score a predictor.
@@ -218,6 +226,7 @@ def score_predictions(
         worst: How many of the worst images to keep pictures of, a task; 0 for none.
         by: Attributes to make tables by.
         paper_batch: Images a batch of the published averages.
+        progress: Called with how many images are scored, and of how many.
         about: Fields of `Provenance` that only the caller knows.
 
     Raises:
@@ -238,7 +247,8 @@ def score_predictions(
     count = len(dataset) if limit is None else min(limit, len(dataset))
     canvases: dict[tuple[int, int], None] = {}
     known = 0
-    for sample, perception in _ahead(lambda index: _with_saved(dataset[index], predictions), range(count), 4, "reader"):
+    scored = _ahead(lambda index: _with_saved(dataset[index], predictions), range(count), 4, "reader")
+    for done, (sample, perception) in enumerate(scored, start=1):
         known += sample.name in predictions.names
         letterbox = Letterbox.fit(perception.size)
         canvases[letterbox.canvas] = None
@@ -247,6 +257,8 @@ def score_predictions(
             perception if "fair" in protocols else None,
             _saved_on_canvas(perception, letterbox) if "paper" in protocols else None,
         )
+        if progress is not None:
+            progress(done, count)
     if predictions.names and not known and count == len(dataset):
         raise DataError(
             f"{predictions.folder}: predictions for none of the {count} images "
@@ -413,7 +425,12 @@ class BestThresholds:
 
 
 def best_thresholds(
-    predictor: EvaluatedPredictor, dataset: LabelledImages, *, batch_size: int = 1, limit: int | None = None
+    predictor: EvaluatedPredictor,
+    dataset: LabelledImages,
+    *,
+    batch_size: int = 1,
+    limit: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> BestThresholds:
     """Find the threshold a task that does best on a validation split, in one pass.
 
@@ -425,6 +442,7 @@ def best_thresholds(
         dataset: Labelled images; not those that are reported on as held out.
         batch_size: At most so many images go through the network at once.
         limit: Only the first so many images.
+        progress: Called with how many images are looked at, and of how many.
 
     Raises:
         ConfigError: If the classes of model and data differ.
@@ -432,6 +450,8 @@ def best_thresholds(
     """
     card = predictor.backend.card
     check_classes(card, dataset)
+    count = len(dataset) if limit is None else min(limit, len(dataset))
+    done = itertools.count(1)
     low = dataclasses.replace(predictor.thresholds, confidence=LOWEST_CONFIDENCE)
     detection = DetectionMetric(card.class_names)
     counts: dict[Task, NDArray[np.int64]] = {
@@ -450,6 +470,8 @@ def best_thresholds(
             if masks is not None and truth is not None:
                 probability = letterbox.mask_to_source(masks[index])
                 counts[task] += _probability_counts(probability, truth, sample.counted(task))
+        if progress is not None:
+            progress(next(done), count)
 
     outputs = closing(_outputs(predictor, dataset, batch_size, limit, None))
     with outputs as batches, _InOrder() as looking:

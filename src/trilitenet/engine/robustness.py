@@ -30,7 +30,7 @@ def corrupted_figures(
     corruptions: Sequence[str] = tuple(CORRUPTIONS),
     severities: Sequence[int] = SEVERITIES,
     seed: int = 0,
-    progress: Callable[[str], None] | None = None,
+    on_pass: Callable[[str], None] | None = None,
     **settings: Any,
 ) -> tuple[Variation, ...]:
     """Evaluate on corrupted images.
@@ -42,7 +42,7 @@ def corrupted_figures(
         corruptions: Keys of `trilitenet.processing.corruptions.CORRUPTIONS`.
         severities: 1 to 5.
         seed: Of what is random; every image has its own draw, the same for every model.
-        progress: Called with the name of each pass before it starts.
+        on_pass: Called with the name of each pass before it starts.
         **settings: Further settings of `evaluate`.
 
     Returns:
@@ -58,8 +58,8 @@ def corrupted_figures(
     for name in corruptions:
         members = []
         for severity in severities:
-            if progress is not None:
-                progress(f"{name} {severity}")
+            if on_pass is not None:
+                on_pass(f"{name} {severity}")
             report = evaluate(
                 predictor, dataset, change=_change(name, severity, seed), resamples=0, worst=0, **settings
             )
