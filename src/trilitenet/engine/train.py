@@ -114,7 +114,8 @@ class TrainResult:
         """Return one line a reader understands; nothing for a process that is not the first."""
         if not self.first:
             return ""
-        speed = f"after {self.steps} steps at {self.images_per_second:.1f} images/s"
+        speed = f"after {self.steps} steps"
+        speed += f" at {self.images_per_second:.1f} images/s" if self.images_per_second else ", none of them new"
         if not self.finished:
             return f"stopped {speed}; {self.folder / CHECKPOINT_NAME} holds its state, go on with --resume"
         figures = ", ".join(f"{name} {value:.4f}" for name, value in self.metrics.items())
