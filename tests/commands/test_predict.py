@@ -1,14 +1,17 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -316,6 +319,30 @@ def test_an_interrupted_run_goes_on_where_it_was(
     assert predict_with(predictor, pictures[:1], tmp_path / "two").images == 1
     report = predict_with(predictor, pictures, tmp_path / "two", skip_existing=True)
     assert (report.images, report.skipped) == (1, 1)
+
+
+def test_the_mark_of_a_video_that_failed_is_there_before_its_results(
+    tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sources = [drive(tmp_path / f"{name}.mp4", frames=8) for name in ("a", "b")]
+    output = tmp_path / "out"
+    decode, write = VideoReader._decode, VideoWriter.write
+    there: list[set[str]] = []
+
+    def lost(self: VideoReader) -> Iterator[Any]:
+        yield from itertools.islice(decode(self), 4 if self.name.endswith("a.mp4") else None)
+        if self.name.endswith("a.mp4"):
+            raise InputError(f"{self.name}: the connection was lost")
+
+    def watched(self: VideoWriter, image: np.ndarray, timestamp: float | None = None) -> None:
+        there.append({path.name for path in output.iterdir()})
+        write(self, image, timestamp)
+
+    monkeypatch.setattr(VideoReader, "_decode", lost)
+    monkeypatch.setattr(VideoWriter, "write", watched)
+    assert predict_with(predictor, sources, output).exit_code == 1
+    assert {"a.json", "a.mp4", "a.unfinished.part"} <= there[4]
+    assert {path.name for path in output.glob("*.part")} == {"a.unfinished.part"}
 
 
 @pytest.mark.parametrize("format", ["jsonl", "csv", "coco", "yolo", "cvat"])

@@ -8,6 +8,7 @@ import logging
 import subprocess
 import sys
 import threading
+import types
 from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -237,6 +238,63 @@ def test_a_file_behind_a_url_whose_connection_is_lost_is_an_error_after_what_cam
         with pytest.raises(InputError, match=r"live\.ts: the connection was lost after \d\.\d s \("):
             frames.extend(source)
     assert 5 < len(frames) < 35
+
+
+@pytest.mark.parametrize("clip", [Clip(), Clip(start=0.05)])
+def test_broken_frames_at_the_beginning_are_counted_once(tmp_path: Path, clip: Clip) -> None:
+    whole, broken = noise(tmp_path / "whole.mp4", 1), tmp_path / "broken.avi"
+    with av.open(str(whole)) as plain, av.open(str(broken), "w") as container:
+        stream = container.add_stream("mjpeg", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 160, 96, "yuvj420p"
+        (frame,) = plain.decode(video=0)
+        for index in range(10):
+            frame.pts, frame.time_base = index, Fraction(1, 10)
+            container.mux(stream.encode(frame.reformat(format="yuvj420p")))
+    data = bytearray(broken.read_bytes())
+    with av.open(str(broken)) as container:
+        packets = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+    for position, size in packets[:3]:
+        data[position + 8 : position + size] = bytes(size - 8)
+    broken.write_bytes(data)
+    assert [frame.index for frame in VideoReader(broken, clip)] == list(range(3, 10))
+
+
+@pytest.mark.parametrize("ending", ["mkv", "flv"])
+def test_sound_that_is_longer_than_the_video_does_not_make_it_cut_off(
+    tmp_path: Path, ending: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path, cut = tmp_path / f"a.{ending}", tmp_path / f"cut.{ending}"
+    with av.open(str(noise(tmp_path / "a.mp4", 10))) as plain, av.open(str(path), "w") as container:
+        stream = container.add_stream("flv1" if ending == "flv" else "mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 160, 96, "yuv420p"
+        sound = container.add_stream("aac", rate=44100, layout="mono")
+        for frame in [*plain.decode(video=0), None]:
+            container.mux(stream.encode(frame))
+        for index in range(130):  # 3 s
+            samples = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+            samples.sample_rate, samples.pts, samples.time_base = 44100, index * 1024, Fraction(1, 44100)
+            container.mux(sound.encode(samples))
+        container.mux(sound.encode(None))
+    assert len(list(VideoReader(path))) == 10
+    assert caplog.text == ""
+    cut.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert 0 < len(list(VideoReader(cut))) < 10
+    assert "the file may be cut off" in caplog.text
+
+
+def test_an_avi_whose_length_could_not_be_written_is_not_cut_off(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "a.avi"
+    with av.open(str(noise(tmp_path / "a.mp4", 10))) as plain, path.open("wb") as file:
+        pipe = types.SimpleNamespace(write=file.write)
+        with av.open(pipe, "w", format="avi") as container:
+            stream = container.add_stream("mpeg4", rate=10)
+            stream.width, stream.height, stream.pix_fmt = 160, 96, "yuv420p"
+            for frame in [*plain.decode(video=0), None]:
+                container.mux(stream.encode(frame))
+    assert len(list(VideoReader(path))) == 10
+    assert caplog.text == ""
 
 
 def test_what_is_no_video_is_named(tmp_path: Path) -> None:

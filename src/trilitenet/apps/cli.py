@@ -195,6 +195,11 @@ def main(words: Sequence[str] | None = None) -> int:
         return _fail("interrupted", code=130)
     except BrokenPipeError:  # the reader, such as `head`, has gone
         _discard_output()
+    except OSError as error:
+        if words and not {"--help", "-h", "--version"} & set(words):
+            raise
+        _discard_output()
+        return _fail(f"standard output: cannot be written ({error.strerror or error})", code=1)
     return int(getattr(result, "exit_code", 0))
 
 

@@ -372,6 +372,11 @@ class _Job:
         """Return the file that is there while the results of a video are not of all its frames."""
         return part_of(self.output / f"{self.stems[name]}.unfinished")
 
+    def _mark_early(self, name: str) -> None:
+        """Leave the mark of a video that ended early, should the run be killed before its end."""
+        if self.unfinished.get(name):
+            self._mark(name).touch()
+
     def _mark_unfinished(self) -> None:
         """Leave a mark beside the results of a video that was not done to its end, and remove those of others."""
         for source in self.sources:
@@ -492,6 +497,7 @@ class _Job:
                     rate = None if source.rate is None else source.rate / self.clip.every
                     video = VideoWriter(self.output / f"{self.stems[source.name]}.mp4", rate)
                     stack.enter_context(video)
+                stack.callback(self._mark_early, source.name)  # before any of its results has its name
             follow = self.road.open(still=False) if isinstance(source, FrameReader) else None
             stream = stack.enter_context(PerceptionStream(source, predictor))
             try:

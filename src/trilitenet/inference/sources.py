@@ -62,6 +62,8 @@ _SLACK: Final = 1e-6
 """Seconds that a time stamp may be off by: a frame at 1/3 s is not before a start of 0.333333."""
 _WITH_LENGTH: Final = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "flv", "asf")
 """FFmpeg's names of the containers that state their length, which of others is found from what is there."""
+_UNKNOWN: Final = 1 << 30
+"""Frames that FFmpeg states in an AVI whose beginning it could not write again, as in a pipe."""
 _Decoded: TypeAlias = tuple[float, Callable[[], NDArray[np.uint8]]]
 """Seconds from the start, and what makes the RGB image of it (not called for frames that are left out)."""
 
@@ -245,7 +247,7 @@ class VideoReader(FrameReader):
         return _open_container(self._path, self.name, timeout=self._timeout)
 
     def _decode(self) -> Any:
-        astray = False
+        astray, broken = False, self.broken
         with self._open() as container:
             sought = bool(self.clip.start) and self._path != "-"
             if sought:
@@ -255,14 +257,15 @@ class VideoReader(FrameReader):
                     container.seek(first + int(self.clip.start / stream.time_base), stream=stream)
             frames = _frames_of(container, self)
             for timestamp, make in itertools.islice(frames, 1):
-                self._skipped = round(timestamp * (self.rate or 0))  # 0 but after a seek
+                if sought:  # the broken frames before it are counted besides
+                    self._skipped = round(timestamp * (self.rate or 0)) - (self.broken - broken)
                 astray = sought and timestamp > self.clip.start + _SLACK
                 if not astray:
                     yield timestamp, make
             if not astray:
                 yield from frames
         if astray:  # as in recordings one after the other, whose time stamps begin anew
-            self._skipped = 0
+            self._skipped, self.broken = 0, broken
             with self._open() as container:
                 yield from _frames_of(container, self)
         if self.broken:
@@ -621,7 +624,8 @@ def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
     first = float(stream.start_time * stream.time_base) if stream.start_time is not None else None
     last = -step
     end = 0.0
-    packets = container.demux(stream)
+    # Without a length of its own, the video is measured by that of the container, which may be that of its sound.
+    packets = container.demux(stream) if reader.live or stream.duration else container.demux()
     while True:
         try:
             packet = next(packets)
@@ -638,6 +642,8 @@ def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
         ticks = packet.dts if packet.pts is None else packet.pts
         if ticks is not None:
             end = max(end, float(ticks * packet.time_base) + (float((packet.duration or 0) * packet.time_base) or step))
+        if packet.stream.index != stream.index:
+            continue
         try:
             frames = packet.decode()
         except av.FFmpegError:
@@ -663,7 +669,7 @@ def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
     if not reader.live and container.format.name in _WITH_LENGTH:
         length = float(stream.duration * stream.time_base) if stream.duration else (container.duration or 0) / 1e6
         if container.format.name == "avi":  # from whose duration FFmpeg takes off what is not there
-            length = stream.frames * step
+            length = stream.frames * step if stream.frames < _UNKNOWN else 0.0
         if length - end > max(0.02 * length, min(1, 5 * step)):
             _LOGGER.warning("%s: ends after %.1f s of %.1f s; the file may be cut off", reader.name, end, length)
 
