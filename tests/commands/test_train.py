@@ -653,6 +653,17 @@ def test_a_table_is_trained_once_and_printed(scenes: Path, tmp_path: Path) -> No
         train_table(table, **moved)
 
 
+def test_a_table_leaves_out_a_task_without_labels(scenes: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    data = shutil.copytree(scenes, tmp_path / "data")
+    shutil.rmtree(data / "da_seg_annotations" / "val")
+    (tmp_path / "a.yaml").write_text("tasks: [drivable, lane]\nvariant: tiny\ninput_size: [64, 128]\nbatch_size: 4\n")
+    (tmp_path / "t.yaml").write_text("title: Parts\nrows: {All: a.yaml}\n")
+    more = "{epochs: 1, max_steps: 1, workers: 0, device: cpu, precision: 32-true, pictures: 0, loggers: []}"
+    result = train_table(tmp_path / "t.yaml", data=data, output=tmp_path / "runs", settings=more)
+    assert re.search(r"\| All \| - \| - \| - \| \d+\.\d \| \d+\.\d \|", result.summary())
+
+
 def test_the_command_line_takes_every_field(scenes: Path, tmp_path: Path) -> None:
     recipe = tmp_path / "r.yaml"
     recipe.write_text(yaml.safe_dump({"data": str(scenes), "input_size": [64, 128], "device": "cpu", "val_split": ""}))

@@ -136,6 +136,14 @@ def test_what_is_not_that_form_is_refused(change: dict[str, Any]) -> None:
         Perception.from_dict(mapping)
 
 
+def test_whole_numbers_with_a_point_are_taken_as_the_schema_does() -> None:
+    form = Perception((4, 6), ("a",), Boxes.empty(), frame=3).to_dict()
+    form |= {"frame": 3.0, "size": {"height": 4.0, "width": 6.0}}
+    seen = Perception.from_dict(form)
+    assert (seen.frame, seen.size) == (3, (4, 6))
+    assert isinstance(seen.frame, int)
+
+
 def test_a_box_without_an_identity_among_others_that_have_one_is_of_no_track() -> None:
     document = perception(track=True).to_dict()
     del document["boxes"][1]["track_id"]

@@ -73,7 +73,7 @@ def test_passes_over_what_else_calibration_programs_write(tmp_path: Path) -> Non
     assert read_camera(path).fx == 1100.0
     for told in (ros + "equidistant\n", OPENCV + "fisheye_model: 1\n"):
         path.write_text(told)
-        with pytest.raises(ConfigError, match=r"lenses of the model (equidistant|fisheye) are not known"):
+        with pytest.raises(ConfigError, match=r"lenses of the model '(equidistant|fisheye)' are not known"):
             read_camera(path)
 
 

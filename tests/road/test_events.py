@@ -112,6 +112,16 @@ def test_a_late_frame_without_a_reading_does_not_end_an_event() -> None:
     assert detector.warnings == ("lane_departure_left",)
 
 
+def test_a_late_frame_does_not_make_an_event_begin_or_end_early() -> None:
+    detector = EventDetector()
+    for timestamp in (10.0, 10.04, 9.7, 10.08):
+        assert not detector.update(road(1.2, 0.02), timestamp)
+    assert detector.update(road(1.2, 0.02), 10.13)
+    for timestamp in (10.17, 9.8, 10.36):
+        assert not detector.update(road(0.0, 0.0), timestamp)
+    assert detector.update(road(0.0, 0.0), 10.68)
+
+
 def test_an_event_as_json() -> None:
     event = Event("forward_collision", "begin", 1.23456, 30, 2.5, 7)
     assert event.to_dict() == {

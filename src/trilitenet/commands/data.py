@@ -64,7 +64,7 @@ class Converted:
         if not any(self.report.labelled.values()):
             return (
                 f"{self.output}: no image is labelled; see above what was found, "
-                "and say what names and values mean with --classes FILE (docs/data.md)",
+                "add missing label files, or say what names and values mean with --classes FILE (docs/data.md)",
             )
         return ()
 

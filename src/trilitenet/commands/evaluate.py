@@ -22,7 +22,7 @@ from trilitenet.engine.provenance import hash_files
 from trilitenet.engine.report import Report, Variation, read_report
 from trilitenet.engine.robustness import corrupted_figures, figures_by_size
 from trilitenet.engine.scorecard import CONDITIONS
-from trilitenet.errors import ConfigError, OutputError
+from trilitenet.errors import ConfigError, DataError, OutputError
 from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.corruptions import SEVERITIES
 
@@ -237,7 +237,10 @@ def known_report(folder: Path, model: str, data_hash: dict[str, str]) -> Report 
     path = folder / "report.json"
     if not path.is_file():
         return None
-    report = read_report(path)
+    try:
+        report = read_report(path)
+    except DataError:  # then it is made anew
+        return None
     same = report.provenance.model_sha256 == hash_model(model) and report.provenance.data_sha256 == data_hash
     return report if same else None
 

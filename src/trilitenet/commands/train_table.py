@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import Counter
 from pathlib import Path
 from typing import Any, Final
@@ -165,7 +166,8 @@ def _measure(weights: Path, network: TriLiteNet, config: TrainConfig) -> dict[st
         device=config.device,
         backend="torch",
     )
-    return {name: report.figures[name].value for name in PAPER_COLUMNS if name in report.figures}
+    figures = {name: report.figures[name].value for name in PAPER_COLUMNS if name in report.figures}
+    return {name: value for name, value in figures.items() if not math.isnan(value)}  # as of a task without labels
 
 
 def _check_done(folder: Path, config: TrainConfig) -> None:

@@ -70,7 +70,7 @@ class Parity:
         if self.boxes is not None and self.boxes < self.tolerance.boxes:
             found.append(f"{self.boxes:.4f} of boxes agree, at least {self.tolerance.boxes} must")
         if self.pixels is None and self.boxes is None:
-            found.append("there was no box to compare; give --frames with vehicles")
+            found.append("there was no box to compare; give --frames with vehicles, or leave --nms out")
         return found
 
     def summary(self) -> str:

@@ -47,9 +47,14 @@ def pick_precision(precision: str, device: str) -> str:
         return precision
     if device == "cuda" or (device == "auto" and torch.cuda.is_available()):
         return "bf16-mixed" if torch.cuda.is_bf16_supported() else "16-mixed"
-    if device in {"auto", "cpu"} and torch.cpu._is_avx512_bf16_supported():
+    if device in {"auto", "cpu"} and _has_bf16():
         return "bf16-mixed"
     return "32-true"
+
+
+def _has_bf16() -> bool:
+    """Return whether an x86 has instructions for bf16; with PyTorch 2.4, which cannot tell, no."""
+    return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", bool)())
 
 
 def _emulates(precision: str, device: str) -> bool:
@@ -58,7 +63,7 @@ def _emulates(precision: str, device: str) -> bool:
         return False
     # Of an x86 with AVX-512, PyTorch says that it computes bf16 whether or not the processor has instructions for it.
     x86 = platform.machine().lower() in {"x86_64", "amd64"}
-    return not (torch.cpu._is_avx512_bf16_supported() if x86 else torch.ops.mkldnn._is_mkldnn_bf16_supported())
+    return not (_has_bf16() if x86 else torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
 def keep_freed_memory() -> None:

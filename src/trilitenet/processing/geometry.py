@@ -160,13 +160,13 @@ class Camera:
         if not self.distortion or not len(points):
             return points
         lens = np.array(self.distortion)
-        found = cv2.undistortPoints(points[:, None], self.matrix, lens, None, None, None, _EXACT)
+        found = cv2.undistortImagePoints(points[:, None], self.matrix, lens, None, _EXACT)  # so in OpenCV 4, too
         ideal = np.asarray(found, np.float64).reshape(-1, 2)
-        local = np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1)
+        local = np.column_stack([(ideal - (self.cx, self.cy)) / (self.fx, self.fy), np.ones(len(ideal))])
         back, _ = cv2.projectPoints(local[:, None], np.zeros(3), np.zeros(3), self.matrix, lens)
         missed = np.linalg.norm(np.asarray(back, np.float64).reshape(-1, 2) - points, axis=1)
         ideal[~(missed <= _MAX_MISS)] = np.nan
-        return ideal * (self.fx, self.fy) + (self.cx, self.cy)
+        return ideal
 
     def to_ground(self, pixels: ArrayLike) -> Floats:
         """Return where pixels meet the flat road.

@@ -158,6 +158,8 @@ def _boxes_from_list(rows: list[dict[str, Any]]) -> Boxes:
 
 
 def _whole(value: Any, name: str) -> int:
+    if isinstance(value, float) and value.is_integer():  # which JSON Schema calls an integer, too
+        return int(value)
     if not isinstance(value, int) or isinstance(value, bool):
         raise ShapeError(f"{name} must be a whole number, got {value!r}")
     return value

@@ -101,10 +101,8 @@ def read_camera(path: str | Path) -> Camera:
         raise ConfigError(f"{path}: must be a mapping of keys such as image_width, camera_matrix and height")
     lens_model = content.pop("distortion_model", _LENSES[0])
     if lens_model not in _LENSES or content.pop("fisheye_model", 0):
-        name = "fisheye" if lens_model in _LENSES else lens_model
-        raise ConfigError(
-            f"{path}: lenses of the model {name} are not known ({', '.join(_LENSES)} are); undistort the pictures first"
-        )
+        name, known = "fisheye" if lens_model in _LENSES else lens_model, ", ".join(_LENSES)
+        raise ConfigError(f"{path}: lenses of the model {name!r} are not known ({known} are); undistort pictures first")
     content = {key: value for key, value in content.items() if key not in _ROS | _OPENCV}
     for key in ("camera_matrix", "distortion_coefficients"):
         if isinstance(content.get(key), list):

@@ -6,9 +6,11 @@ Advisory only: they rest on one camera and a light network, and no safety functi
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Literal, TypeAlias
 
 from trilitenet.errors import ConfigError
+from trilitenet.road.ego import LATE
 from trilitenet.road.structures import Event, EventKind, Road
 
 __all__ = ["EventDetector", "EventThresholds"]
@@ -54,13 +56,13 @@ class _State:
 
     on: bool = False
     since: float | None = None
-    read: float = 0.0
+    read: float = -math.inf
     value: float = 0.0
 
     def step(
         self, wants: bool | None, value: float | None, timestamp: float, limits: EventThresholds
     ) -> Literal["begin", "end"] | None:
-        """Take in one frame.
+        """Take in one frame; one that is late adds nothing.
 
         Args:
             wants: True or False for what this frame says, None if it says nothing.
@@ -68,6 +70,8 @@ class _State:
             timestamp: Seconds.
             limits: How long a beginning and an end must hold, and how long there may be nothing.
         """
+        if -LATE <= timestamp - self.read < 0:
+            return None
         if value is not None:
             self.value = value
         if wants is None:
@@ -80,7 +84,7 @@ class _State:
         if wants == self.on:
             self.since = None
             return None
-        if self.since is None or timestamp < self.since:  # the latter of a late frame, or of a clock that was set back
+        if self.since is None or timestamp < self.since:  # the latter of a clock that was set back
             self.since = timestamp
         if timestamp - self.since < (limits.hold if self.on else limits.confirm):
             return None

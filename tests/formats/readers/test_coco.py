@@ -182,7 +182,10 @@ def test_annotations_of_no_image_are_counted(tmp_path: Path) -> None:
 def test_annotations_that_are_all_of_no_image_are_refused(tmp_path: Path) -> None:
     write(tmp_path / "one.png")
     write(tmp_path / "labels.json", coco(annotations=[{**item, "image_id": "7"} for item in coco()["annotations"]]))
-    with pytest.raises(DataError, match=r"no annotation has the id of an image \(image_id '7', but images 7, \.\.\.\)"):
+    with pytest.raises(DataError, match=r"the id of an image \(image_id '7', but images 7, \.\.\.\); write both alike"):
+        read_coco(tmp_path)
+    write(tmp_path / "labels.json", coco(annotations=[{**item, "image_id": 8} for item in coco()["annotations"]]))
+    with pytest.raises(DataError, match=r"\(image_id 8, but images 7, \.\.\.\); they are of other images"):
         read_coco(tmp_path)
 
 

@@ -116,12 +116,15 @@ def _read_file(
         labels: dict[Any, list[dict[str, Any]]] = defaultdict(list)
         for item in content["annotations"]:
             labels[item["image_id"]].append(item)
-        stray = labels.keys() - {image["id"] for image in content["images"]}
+        known = {image["id"] for image in content["images"]}
+        stray = labels.keys() - known
         strays = sum(len(labels[number]) for number in stray)
         if content["images"] and stray and stray == labels.keys():
+            alike = set(map(str, stray)) & set(map(str, known))
+            cure = "write both alike, as numbers or as text" if alike else "they are of other images"
             raise DataError(
                 f"{path}: no annotation has the id of an image (image_id {min(map(repr, stray))}, but images "
-                f"{content['images'][0]['id']!r}, ...); write both alike, as numbers or as text"
+                f"{content['images'][0]['id']!r}, ...); {cure}"
             )
         tasks = mapping.labelled(set(names.values()))
         categories.update(names.values())

@@ -182,7 +182,7 @@ def _read_text(path: Path) -> str:
 
 def _candidates(base: Path, beside: Path, place: str) -> list[tuple[Path, str]]:
     """Return (folder, place in it) where images may be; Roboflow writes ``../train/images`` of what lies beside."""
-    return [(root, part) for part in (place, place.removeprefix("../")) for root in (base, beside)]
+    return [(root, part) for part in dict.fromkeys((place, place.removeprefix("../"))) for root in (base, beside)]
 
 
 def _images_at(candidates: list[tuple[Path, str]]) -> list[Path]:
