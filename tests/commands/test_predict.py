@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -255,21 +255,24 @@ def test_a_broken_video_among_good_sources(tmp_path: Path, predictor: Predictor)
     assert {Path(failure.source).name for failure in report.failures} == {"broken.mp4", "empty.mp4"}
 
 
+def write_until(frame: int, interrupt: Callable[[], object]) -> Callable[..., None]:
+    """Return what `VideoWriter.write` does, with an interruption before the frame of this number, from 1."""
+    write, numbers = VideoWriter.write, itertools.count(1)
+
+    def interrupted(self: VideoWriter, image: np.ndarray, timestamp: float | None = None) -> None:
+        if next(numbers) == frame:
+            interrupt()
+        write(self, image, timestamp)
+
+    return interrupted
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interruption_leaves_a_playable_video_of_the_frames_in_the_other_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
     predictor = Predictor(ColourBackend(), batch_size=1)
-    written = 0
-    write = VideoWriter.write
-
-    def interrupted(self: VideoWriter, image: np.ndarray, timestamp: float | None = None) -> None:
-        nonlocal written
-        written += 1
-        if written == 6:
-            signal.raise_signal(number)
-        write(self, image, timestamp)
-
+    interrupted = write_until(6, lambda: signal.raise_signal(number))
     source = drive(tmp_path / "drive.mp4", frames=40)
     monkeypatch.setattr(VideoWriter, "write", interrupted)
     before = signal.signal(number, signal.default_int_handler)
@@ -289,16 +292,7 @@ def test_an_interrupted_run_goes_on_where_it_was(
 ) -> None:
     sources = [drive(tmp_path / f"{name}.mp4", frames=8) for name in ("a", "b", "c")]
     output, formats = tmp_path / "out", ("json", "openlabel", "cvat")
-    taken = 0
-    write = VideoWriter.write
-
-    def interrupted(self: VideoWriter, image: np.ndarray, timestamp: float | None = None) -> None:
-        nonlocal taken
-        taken += 1
-        if taken == 12:
-            raise KeyboardInterrupt
-        write(self, image, timestamp)
-
+    interrupted = write_until(12, lambda: signal.default_int_handler(signal.SIGINT, None))
     with monkeypatch.context() as patch:
         patch.setattr(VideoWriter, "write", interrupted)
         assert predict_with(predictor, sources, output, format=formats).interrupted

@@ -313,17 +313,22 @@ def test_the_worst_images_are_the_worst_of_all() -> None:
         assert [frame.score for frame in few if frame.task == task] == scores[:3]
 
 
-def test_thresholds_are_not_told_from_what_does_not_count() -> None:
-    images = Images()
-    predictor = fake_predictor(images)
+def make_unsure(predictor: FakePredictor, inside: int, outside: int) -> None:
+    """Let a predictor give these probabilities x 255 of drivable in place of 255 and 0."""
     run = predictor.backend.run
 
     def unsure(batch: np.ndarray) -> RawOutputs:
         raw = run(batch)
         assert raw.drivable is not None
-        return dataclasses.replace(raw, drivable=np.where(raw.drivable == 255, 80, 60).astype(np.uint8))
+        return dataclasses.replace(raw, drivable=np.where(raw.drivable == 255, inside, outside).astype(np.uint8))
 
     predictor.backend.run = unsure  # type: ignore[method-assign]
+
+
+def test_thresholds_are_not_told_from_what_does_not_count() -> None:
+    images = Images()
+    predictor = fake_predictor(images)
+    make_unsure(predictor, 80, 60)
     plain = best_thresholds(predictor, images)
     for index, sample in enumerate(images._samples):  # wrong labels on the own car, which is the lower half
         assert sample.drivable is not None
@@ -338,14 +343,7 @@ def test_thresholds_are_not_told_from_what_does_not_count() -> None:
 def test_the_best_threshold_lies_just_below_the_best_value() -> None:
     images = Images()
     predictor = fake_predictor(images)
-    run = predictor.backend.run
-
-    def close(batch: np.ndarray) -> RawOutputs:
-        raw = run(batch)
-        assert raw.drivable is not None
-        return dataclasses.replace(raw, drivable=np.where(raw.drivable == 255, 80, 79).astype(np.uint8))
-
-    predictor.backend.run = close  # type: ignore[method-assign]
+    make_unsure(predictor, 80, 79)
     predictor.thresholds = best_thresholds(predictor, images).thresholds
     assert values(evaluate(predictor, images, resamples=0))["fair/drivable/iou"] == 1.0
 

@@ -133,8 +133,8 @@ _LISTS: Final = {
     "--format": "json|jsonl|scalabel|openlabel|coco|yolo|cvat|parquet|csv",
     "--hide": "drivable|lane|boxes|labels|lines|distances|above|status",
     "--lane-width": r"([\w*.-]+=)?\d+(\.\d+)?",
-    "--precisions": "fp32|fp16|bf16|int8",
     "--loggers": "csv|tensorboard|mlflow|wandb",
+    "--precisions": "fp32|fp16|bf16|int8",
     "--resolution": r"\d+",
     "--severities": r"\d+",
     "--splits": r"(train|val|valid|validation|test)([-_.]\w+)?",
@@ -198,8 +198,7 @@ def main(words: Sequence[str] | None = None) -> int:
     except OSError as error:
         if words and not {"--help", "-h", "--version"} & set(words):
             raise
-        _discard_output()
-        return _fail(f"standard output: cannot be written ({error.strerror or error})", code=1)
+        return _fail(_output_failed(error), code=1)
     return int(getattr(result, "exit_code", 0))
 
 
@@ -306,11 +305,16 @@ def _show(result: object) -> None:
     except BrokenPipeError:
         raise
     except OSError as error:
-        _discard_output()
-        raise OutputError(f"standard output: cannot be written ({error.strerror or error})") from error
+        raise OutputError(_output_failed(error)) from error
     finally:
         for line in getattr(result, "errors", ()):
             sys.stderr.write(f"error: {line}\n")
+
+
+def _output_failed(error: OSError) -> str:
+    """Discard what standard output takes no more, and return why in words."""
+    _discard_output()
+    return f"standard output: cannot be written ({error.strerror or error})"
 
 
 def _discard_output() -> None:

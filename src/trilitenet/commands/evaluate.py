@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -232,8 +232,14 @@ def hash_dataset(dataset: DrivingDataset, limit: int | None = None) -> dict[str,
     }
 
 
-def known_report(folder: Path, model: str, data_hash: dict[str, str]) -> Report | None:
-    """Return the report that is in a folder, if it is of this model's file and of these images and labels."""
+def known_report(folder: Path, model: str, data_hash: Callable[[], dict[str, str]]) -> Report | None:
+    """Return the report that is in a folder, if it is of this model's file and of these images and labels.
+
+    Args:
+        folder: The folder.
+        model: The file.
+        data_hash: Gives what `hash_dataset` does; called for a report of this file alone.
+    """
     path = folder / "report.json"
     if not path.is_file():
         return None
@@ -241,7 +247,7 @@ def known_report(folder: Path, model: str, data_hash: dict[str, str]) -> Report 
         report = read_report(path)
     except DataError:  # then it is made anew
         return None
-    same = report.provenance.model_sha256 == hash_model(model) and report.provenance.data_sha256 == data_hash
+    same = report.provenance.model_sha256 == hash_model(model) and report.provenance.data_sha256 == data_hash()
     return report if same else None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import math
 import sys
@@ -179,7 +180,9 @@ def evaluate_table(
             folder = output / (name if format == "openvino" else f"{name}-{format}")
             files = [artefact, *([artefact.with_suffix(".bin")] if format == "openvino" else [])]
             made = not overwrite and all(file.is_file() for file in files)
-            report = known_report(folder, str(artefact), hashes[classes]) if made else None
+            report = (
+                known_report(folder, str(artefact), functools.partial(hashes.__getitem__, classes)) if made else None
+            )
             if report is None:
                 stage = f"{model} {precision} ({len(rows) + 1} of {len(models or VARIANTS) * len(precisions)})"
                 if not made:

@@ -372,20 +372,18 @@ class _Job:
         """Return the file that is there while the results of a video are not of all its frames."""
         return part_of(self.output / f"{self.stems[name]}.unfinished")
 
-    def _mark_early(self, name: str) -> None:
-        """Leave the mark of a video that ended early, should the run be killed before its end."""
+    def _mark_unfinished(self, name: str) -> None:
+        """Leave the mark of a video that was not done to its end."""
         if self.unfinished.get(name):
             self._mark(name).touch()
 
-    def _mark_unfinished(self) -> None:
-        """Leave a mark beside the results of a video that was not done to its end, and remove those of others."""
+    def _remove_marks(self) -> None:
+        """Remove the marks of videos that were done to their end, and of those that have no results."""
         for source in self.sources:
             if isinstance(source, FrameReader) and source.name in self.unfinished:
                 mark = self._mark(source.name)
-                with writing(mark):
-                    if self.unfinished[source.name] and any(map(Path.exists, self._files(source, source.name))):
-                        mark.touch()
-                    else:
+                if not (self.unfinished[source.name] and any(map(Path.exists, self._files(source, source.name)))):
+                    with writing(mark):
                         mark.unlink(missing_ok=True)
 
     def _check_output(self) -> None:
@@ -447,7 +445,7 @@ class _Job:
         interrupted = False
         with contextlib.ExitStack() as stack:
             stack.enter_context(writing(self.output))
-            stack.callback(self._mark_unfinished)  # once all files have their names
+            stack.callback(self._remove_marks)  # once all files have their names
             if self.sources:
                 self.output.mkdir(parents=True, exist_ok=True)
                 for name in self.formats:
@@ -497,7 +495,7 @@ class _Job:
                     rate = None if source.rate is None else source.rate / self.clip.every
                     video = VideoWriter(self.output / f"{self.stems[source.name]}.mp4", rate)
                     stack.enter_context(video)
-                stack.callback(self._mark_early, source.name)  # before any of its results has its name
+                stack.callback(self._mark_unfinished, source.name)  # before any of its results has its name
             follow = self.road.open(still=False) if isinstance(source, FrameReader) else None
             stream = stack.enter_context(PerceptionStream(source, predictor))
             try:

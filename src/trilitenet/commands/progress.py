@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-__all__ = ["Shown", "show_progress"]
+__all__ = ["ProgressBar", "show_progress"]
 
 
-class Shown:
+class ProgressBar:
     """A bar: called with how much is done, and of how much."""
 
     def __init__(self, progress: Progress, task: TaskID) -> None:
@@ -27,7 +27,7 @@ class Shown:
 
 
 @contextlib.contextmanager
-def show_progress(what: str) -> Iterator[Shown]:
+def show_progress(what: str) -> Iterator[ProgressBar]:
     """Yield a bar that is gone at the end.
 
     Args:
@@ -35,4 +35,4 @@ def show_progress(what: str) -> Iterator[Shown]:
     """
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        yield Shown(progress, progress.add_task(what, total=None))
+        yield ProgressBar(progress, progress.add_task(what, total=None))

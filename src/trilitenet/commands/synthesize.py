@@ -6,10 +6,8 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from rich.console import Console
-from rich.progress import track
-
 from trilitenet.commands.paths import text_paths
+from trilitenet.commands.progress import show_progress
 from trilitenet.data.synthetic_files import write_dataset
 
 __all__ = ["Synthesized", "synthesize"]
@@ -62,12 +60,10 @@ def synthesize(
     Raises:
         OutputError: If the split is there already, whole or of another command.
     """
-    steps = iter(track(range(count), "scenes", transient=True, console=Console(stderr=True)))
+    with show_progress("scenes") as shown:
 
-    def advance(done: int) -> None:
-        del done
-        next(steps, None)
+        def advance(done: int) -> None:
+            shown(done, count)
 
-    write_dataset(output, split, count, seed, size=size, labels=labels, workers=workers, progress=advance)
-    next(steps, None)
+        write_dataset(output, split, count, seed, size=size, labels=labels, workers=workers, progress=advance)
     return Synthesized(output, split, count)

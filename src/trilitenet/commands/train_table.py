@@ -123,11 +123,11 @@ def train_table(table: Path, /, *, data: Path, output: Path, resume: bool = Fals
             f"settings must be YAML such as '{{epochs: 10}}', without data and output, and no null, got {settings!r}"
         )
     fields: dict[str, Any] = {str(name): value for name, value in more.items()} | {"data": str(data)}
-    for recipe in recipes.values():
-        config = read_recipe(recipe, fields)
+    configs = {name: read_recipe(recipe, fields) for name, recipe in recipes.items()}
+    for name, recipe in recipes.items():
         folder = output / recipe.stem
         if (folder / _WEIGHTS).is_file():
-            _check_done(folder, config)
+            _check_done(folder, configs[name])
     rows: list[TableRow] = []
     first = True
     for name, recipe in recipes.items():
@@ -141,7 +141,7 @@ def train_table(table: Path, /, *, data: Path, output: Path, resume: bool = Fals
         if not finished:
             break
         network = load_network(weights)
-        figures = _measure(weights, network, read_recipe(recipe, fields)) if first else {}
+        figures = _measure(weights, network, configs[name]) if first else {}
         rows.append(
             TableRow(name, figures, count_parameters(network), count_multiply_adds(network, network.card.input_size))
         )
@@ -154,7 +154,7 @@ def _measure(weights: Path, network: TriLiteNet, config: TrainConfig) -> dict[st
         return {}
     dataset = DrivingDataset(config.data, config.val_split, class_names=network.card.class_names)
     folder = weights.parent / _REPORT
-    report = known_report(folder, str(weights), hash_dataset(dataset)) or evaluate(
+    report = known_report(folder, str(weights), lambda: hash_dataset(dataset)) or evaluate(
         str(weights),
         data=Path(config.data),
         split=config.val_split,

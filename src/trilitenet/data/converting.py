@@ -33,6 +33,7 @@ from trilitenet.data.description import (
     DatasetDescription,
     MaskMeaning,
     class_table,
+    is_folder_name,
     read_description,
     write_description,
 )
@@ -176,7 +177,7 @@ def convert(
     if unknown:
         raise DataError(f"no split {unknown[0]!r}; there are {', '.join(source.splits)}")
     for split in chosen:
-        if Path(split).name != split or split in {"", ".", ".."} or "\0" in split:
+        if not is_folder_name(split):
             raise DataError(f"split {split!r} is not the name of one folder; rename it where the source names it")
     state = _open_state(root, options, source.origin)
     names = {split: source.names(split) for split in chosen}

@@ -18,6 +18,7 @@ __all__ = [
     "DatasetDescription",
     "MaskMeaning",
     "class_table",
+    "is_folder_name",
     "read_description",
     "write_description",
 ]
@@ -83,6 +84,11 @@ class DatasetDescription:
     def class_names(self) -> tuple[str, ...]:
         """Class names in the order of their ids; ``("vehicle",)`` if the file names none."""
         return tuple(self.classes) or ("vehicle",)
+
+
+def is_folder_name(split: str) -> bool:
+    """Return whether a split is the name of one folder: its files stay inside the data set's."""
+    return Path(split).name == split and split not in {"", ".", ".."} and "\0" not in split
 
 
 def class_table(class_names: Sequence[str], classes: Mapping[str, Sequence[str]] | None = None) -> dict[str, int]:

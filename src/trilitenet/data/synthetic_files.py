@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from trilitenet.data.description import DESCRIPTION_FILE, DatasetDescription, write_description
+from trilitenet.data.description import DESCRIPTION_FILE, DatasetDescription, is_folder_name, write_description
 from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, IMAGE_FOLDER, LANE_FOLDER
 from trilitenet.data.sample import Sample
 from trilitenet.data.synthetic import SyntheticScenes
@@ -64,7 +64,7 @@ def write_dataset(
         raise ConfigError(f"seed must not be negative, got {seed}")
     SyntheticScenes(seed, size, count, labels=labels)  # refuses a wrong size before there is a folder
     root = Path(root)
-    if Path(split).name != split or split in {"", ".", ".."}:
+    if not is_folder_name(split):
         raise ConfigError(f"split must be the name of one folder, got {split!r}")
     state = root / f".synthesis-{split}.json"
     call = json.dumps({"seed": seed, "count": count, "size": size, "labels": labels}).encode()

@@ -158,7 +158,7 @@ def evaluate(
     )
     started = time.time()
     canvases: dict[tuple[int, int], None] = {}
-    count = len(dataset) if limit is None else min(limit, len(dataset))
+    count = _count(dataset, limit)
     done = itertools.count(1)
 
     def score(sample: LabelledImage, prediction: Prediction) -> None:
@@ -244,7 +244,7 @@ def score_predictions(
         by=by,
     )
     started = time.time()
-    count = len(dataset) if limit is None else min(limit, len(dataset))
+    count = _count(dataset, limit)
     canvases: dict[tuple[int, int], None] = {}
     known = 0
     scored = _ahead(lambda index: _with_saved(dataset[index], predictions), range(count), 4, "reader")
@@ -310,6 +310,10 @@ def check_classes(card: ModelCard, dataset: LabelledImages) -> None:
             f"the model has classes {', '.join(card.class_names)}, the labels {', '.join(names)}; "
             "read the data set with the model's classes"
         )
+
+
+def _count(dataset: LabelledImages, limit: int | None) -> int:
+    return len(dataset) if limit is None else min(limit, len(dataset))
 
 
 def _settings(protocols: Sequence[str], paper_batch: int, resamples: int, seed: int) -> dict[str, Any]:
@@ -450,7 +454,7 @@ def best_thresholds(
     """
     card = predictor.backend.card
     check_classes(card, dataset)
-    count = len(dataset) if limit is None else min(limit, len(dataset))
+    count = _count(dataset, limit)
     done = itertools.count(1)
     low = dataclasses.replace(predictor.thresholds, confidence=LOWEST_CONFIDENCE)
     detection = DetectionMetric(card.class_names)
@@ -534,7 +538,7 @@ def _outputs(
     Reading and letterboxing go ahead in a thread of their own. Where the backend can, several threads compute a batch
     each on cores of their own: scoring beside a network that has all cores would make each of its layers wait.
     """
-    count = len(dataset) if limit is None else min(limit, len(dataset))
+    count = _count(dataset, limit)
     if count < 1 or batch_size < 1:
         raise DataError(f"no images to evaluate on (images {count}, batch size {batch_size})")
     backend = predictor.backend
