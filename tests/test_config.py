@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from trilitenet.config import DEFAULT_ANCHORS, ArtefactInfo, ModelCard, Thresholds, parse
+from trilitenet.config import DEFAULT_ANCHORS, ArtefactInfo, ModelCard, Thresholds, parse, parse_yaml
 from trilitenet.errors import ConfigError, WeightsError
 
 
@@ -14,6 +14,8 @@ from trilitenet.errors import ConfigError, WeightsError
 class Settings:
     rate: float = 1.0
     names: tuple[str, ...] = ("a", "b")
+    on: bool = False
+    size: tuple[int, int] = (1, 1)
     thresholds: Thresholds = dataclasses.field(default_factory=Thresholds)
 
     def __post_init__(self) -> None:
@@ -33,6 +35,35 @@ def test_what_a_dataclass_refuses_is_told_in_its_own_words() -> None:
 def test_a_value_of_the_wrong_type_is_told_with_its_field() -> None:
     with pytest.raises(ConfigError, match=r"^here: rate: .*number.*, got 'fast'$"):
         parse(Settings, {"rate": "fast"}, "here")
+
+
+@pytest.mark.parametrize(
+    ("given", "where"),
+    [({"rate": True}, "rate"), ({"thresholds": {"lane": False}}, "thresholds.lane"), ({"size": [True, 2]}, "size.0")],
+)
+def test_a_flag_is_no_number(given: dict[str, object], where: str) -> None:
+    with pytest.raises(ConfigError, match=rf"^here: {where}: Input should be a number, got (True|False)$"):
+        parse(Settings, given, "here")
+    assert parse(Settings, {"on": True, "size": ("1", 2)}, "here") == Settings(on=True, size=(1, 2))
+
+
+def test_yaml_with_a_key_twice_is_refused_with_its_line() -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_yaml("epochs: 2\nlr: 1\nepochs: 3\n", "here")
+    assert str(caught.value) == "here: not YAML (line 3: key 'epochs' twice)"
+    with pytest.raises(ConfigError, match=r"line 1: key 'a' twice"):
+        parse_yaml("x: {a: 1, a: 1}", "here")
+    anchors = "one: &one {a: 1, b: 2}\ntwo: {<<: *one, b: 3}\nthree: {<<: *one, <<: {c: 1}}"
+    assert parse_yaml(anchors, "here")["two"] == {"a": 1, "b": 3}
+
+
+def test_broken_yaml_is_told_with_its_line() -> None:
+    with pytest.raises(ConfigError, match=r"^here: not YAML \(line 2: while parsing .*\)$"):
+        parse_yaml("a: [1,\nb: }", "here")
+    with pytest.raises(ConfigError, match=r"here: not YAML .*recursion"):
+        parse_yaml("[" * 3000, "here")
+    with pytest.raises(ConfigError, match=r"here: not YAML .*month"):
+        parse_yaml("day: 2024-13-01", "here")
 
 
 @pytest.mark.parametrize(

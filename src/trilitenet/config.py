@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
@@ -43,6 +43,7 @@ __all__ = [
     "check_tasks",
     "get_variant",
     "parse",
+    "parse_yaml",
     "read_yaml",
     "shipped_weights",
 ]
@@ -317,9 +318,12 @@ def parse(cls: type[_T], mapping: Mapping[str, Any], source: str) -> _T:
         ConfigError: On an unknown key (naming the nearest known one), a missing key or a value of the wrong type.
     """
     try:
-        return _adapter(cls).validate_python(dict(mapping))
+        result = _adapter(cls).validate_python(dict(mapping))
     except ValidationError as error:
         raise ConfigError(f"{source}: {_explain(cls, error)}") from error
+    for path, given in _flags_for_numbers(result, mapping):
+        raise ConfigError(f"{source}: {path}: Input should be a number, got {given}")
+    return result
 
 
 def check_size(size: tuple[int, int], name: str = "size") -> None:
@@ -346,6 +350,35 @@ def check_anchors(anchors: Anchors) -> None:
             raise ConfigError(f"anchors must be above 0 and finite, got {side}")
 
 
+def parse_yaml(text: str, source: str) -> Any:
+    """Parse YAML; ``source`` is where it came from, for messages.
+
+    Raises:
+        ConfigError: If it is not YAML, or gives a key twice.
+    """
+    try:
+        return yaml.load(text, _YamlLoader)  # noqa: S506 - plain values only
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date that there is not
+        reason = str(error)
+        if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+            reason = f"line {error.problem_mark.line + 1}: {error.context or ''} {error.problem}"
+        raise ConfigError(f"{source}: not YAML ({' '.join(reason.split())})") from error
+
+
+class _YamlLoader(yaml.SafeLoader):
+    """Plain values only, and no key twice: the last one would silently win."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        keys: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
+                if key.value in keys:
+                    problem = f"key {key.value!r} twice"
+                    raise yaml.constructor.ConstructorError(problem=problem, problem_mark=key.start_mark)
+                keys.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
 def read_yaml(path: str | Path) -> dict[str, Any]:
     """Read a YAML file of ``key: value`` lines; an empty one gives an empty mapping.
 
@@ -353,11 +386,12 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
         ConfigError: If it cannot be read, is not YAML, or holds something else than a mapping.
     """
     try:
-        content: Any = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        text = Path(path).read_text(encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
-    except (yaml.YAMLError, ValueError) as error:  # the latter of text not in UTF-8, and of a date that there is not
-        raise ConfigError(f"{path}: not YAML ({' '.join(str(error).split())})") from error
+    except ValueError as error:
+        raise ConfigError(f"{path}: not text in UTF-8 ({error})") from error
+    content = parse_yaml(text, str(path))
     if content is None:
         return {}
     if not isinstance(content, dict):
@@ -422,6 +456,20 @@ def _forbid_extra(cls: type[Any]) -> None:
         factory = field.default_factory
         if isinstance(factory, type) and dataclasses.is_dataclass(factory):
             _forbid_extra(factory)
+
+
+def _flags_for_numbers(value: Any, given: Any, path: str = "") -> Iterable[tuple[str, bool]]:
+    """Find where pydantic took true for 1 or false for 0, as YAML's ``on``, ``yes`` and ``no`` give them too."""
+    if isinstance(given, bool):
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            yield path, given
+    elif isinstance(given, Mapping):
+        known = value if isinstance(value, Mapping) else vars(value)
+        for key, item in given.items():
+            yield from _flags_for_numbers(known.get(key), item, f"{path}.{key}".lstrip("."))
+    elif isinstance(given, (list, tuple)):
+        for index, (inner, item) in enumerate(zip(value, given, strict=True)):
+            yield from _flags_for_numbers(inner, item, f"{path}.{index}".lstrip("."))
 
 
 def _explain(cls: type[Any], error: ValidationError) -> str:

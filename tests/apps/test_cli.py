@@ -102,6 +102,9 @@ def test_a_program_that_goes_on_handles_signals_as_before(
     assert {number: signal.getsignal(number) for number in handlers} == handlers
 
 
+_NO_INT = 'error: Invalid value for --loudness: unable to convert "{}" into int (see: trilitenet greet --help)\n'
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -115,7 +118,8 @@ def test_a_program_that_goes_on_handles_signals_as_before(
         (["greet", "a", "--nonsense"], "error: unknown option --nonsense (see: trilitenet greet --help)\n"),
         (["greet", "a", "--louder=3"], None),
         (["greet", "a", "1", "2"], None),
-        (["greet", "a", "--loudness", "much"], None),
+        (["greet", "a", "--loudness", "much"], _NO_INT.format("much")),
+        (["greet", "a", "--loudness", "2.5"], _NO_INT.format("2.5")),
     ],
 )
 def test_misuse_is_one_line_and_exit_code_2(

@@ -448,11 +448,10 @@ def test_refusals(scenes: Path, tmp_path: Path) -> None:
         train(**settings(scenes, tmp_path / "file" / "run", max_steps=1))
     with pytest.raises(ConfigError, match="without data and output"):
         train_table(TABLES[0], data=scenes, output=tmp_path, settings="{data: x}")
-    with pytest.raises(ConfigError, match="must be YAML"):
+    with pytest.raises(ConfigError, match="settings: not YAML"):
         train_table(TABLES[0], data=scenes, output=tmp_path, settings="{a: [")
-    for text in ("{multi_scale: null}", "{a: 2024-13-45}"):
-        with pytest.raises(ConfigError, match="settings must be YAML"):
-            train_table(TABLES[0], data=scenes, output=tmp_path, settings=text)
+    with pytest.raises(ConfigError, match="settings must be YAML"):
+        train_table(TABLES[0], data=scenes, output=tmp_path, settings="{multi_scale: null}")
     for unknown in ("resume", "1"):
         with pytest.raises(ConfigError, match=f"unknown key '{unknown}'"):
             train_table(TABLES[0], data=scenes, output=tmp_path, settings=f"{{{unknown}: 2}}")

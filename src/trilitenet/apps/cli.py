@@ -23,7 +23,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, get_args
 
 import cyclopts
 from cyclopts.exceptions import CycloptsError, UnknownOptionError, UnusedCliTokensError
@@ -107,7 +107,7 @@ def build_app(words: Sequence[str] = (), *, everything: bool = False) -> cyclopt
         help="Light driving perception: vehicles, drivable area and lane lines from one tiny network.",
         version=f"trilitenet {trilitenet.__version__}",
         help_format="markdown",
-        default_parameter=cyclopts.Parameter(negative_iterable=()),
+        default_parameter=cyclopts.Parameter(negative_iterable=(), converter=_converted),
         help_on_error=False,
         suppress_keyboard_interrupt=False,
     )
@@ -124,6 +124,15 @@ def build_app(words: Sequence[str] = (), *, everything: bool = False) -> cyclopt
         if any(not name.startswith("-") for name in group):
             app.command(group)
     return app
+
+
+def _converted(type_: Any, tokens: Sequence[cyclopts.Token]) -> Any:
+    """Convert words as the parser does, but round no fraction where whole numbers are asked for."""
+    if int in (type_, *get_args(type_)):
+        fraction = next((token for token in tokens if "." in token.value), None)
+        if fraction is not None:
+            raise cyclopts.CoercionError(token=fraction, target_type=int)
+    return cyclopts.convert(type_, tokens)
 
 
 _LISTS: Final = {

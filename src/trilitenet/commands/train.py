@@ -16,14 +16,13 @@ from typing import Annotated, Any, Final, get_type_hints
 import cyclopts
 import numpy as np
 import torch
-import yaml
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from trilitenet.commands.evaluate import warn_of_foreign
 from trilitenet.commands.paths import text_paths
-from trilitenet.config import DEFAULT_ANCHORS, ModelCard
+from trilitenet.config import DEFAULT_ANCHORS, ModelCard, parse_yaml
 from trilitenet.data.contact_sheet import as_perception
 from trilitenet.data.identity import identify, parts_of
 from trilitenet.data.loader import build_loader
@@ -425,10 +424,7 @@ def _nested(fields: Mapping[str, Any]) -> dict[str, Any]:
         if value is None:
             continue
         if name in _YAML_FLAGS and isinstance(value, str):
-            try:
-                value = yaml.safe_load(value)
-            except (yaml.YAMLError, ValueError) as error:  # the latter of a date that there is not
-                raise ConfigError(f"--{name.replace('__', '.')}: not YAML ({' '.join(str(error).split())})") from error
+            value = parse_yaml(value, f"--{name.replace('__', '.').replace('_', '-')}")
         first, *inner = name.split("__")
         for part in reversed(inner):
             value = {part: value}

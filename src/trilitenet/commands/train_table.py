@@ -8,13 +8,11 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, Final
 
-import yaml
-
 from trilitenet.commands.evaluate import evaluate, hash_dataset, known_report
 from trilitenet.commands.paths import text_paths
 from trilitenet.commands.tables import PAPER_COLUMNS, markdown_row
 from trilitenet.commands.train import train, training_data
-from trilitenet.config import read_yaml
+from trilitenet.config import parse_yaml, read_yaml
 from trilitenet.data.identity import identify, tell_apart
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.checkpoint import read_checkpoint
@@ -114,10 +112,7 @@ def train_table(table: Path, /, *, data: Path, output: Path, resume: bool = Fals
         OutputError: If a row that is done was trained with other settings or on other data.
     """
     title, recipes = _read(table)
-    try:
-        more = yaml.safe_load(settings) if settings else {}
-    except (yaml.YAMLError, ValueError):  # the latter of a date that there is not
-        more = None
+    more = parse_yaml(settings, "settings") if settings else {}
     if not isinstance(more, dict) or {"data", "output"} & more.keys() or None in more.values():
         raise ConfigError(
             f"settings must be YAML such as '{{epochs: 10}}', without data and output, and no null, got {settings!r}"

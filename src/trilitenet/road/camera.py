@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from trilitenet.config import parse
+from trilitenet.config import parse, parse_yaml
 from trilitenet.errors import ConfigError, write_file
 from trilitenet.processing.geometry import Camera
 from trilitenet.road.lanes import vanishing_point
@@ -93,10 +93,7 @@ def read_camera(path: str | Path) -> Camera:
         raise ConfigError(f"{path}: cannot be read as a camera file ({error})") from error
     # OpenCV's FileStorage writes a directive and a tag that are no standard YAML.
     text = re.sub(r"\A%YAML.*\n", "", text).replace("!!opencv-matrix", "")
-    try:
-        content: Any = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError) as error:  # the latter of a date that there is not
-        raise ConfigError(f"{path}: not YAML ({' '.join(str(error).split())})") from error
+    content = parse_yaml(text, str(path))
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: must be a mapping of keys such as image_width, camera_matrix and height")
     lens_model = content.pop("distortion_model", _LENSES[0])

@@ -102,7 +102,7 @@ def test_errors(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"data\.yaml: not text in UTF-8"):
         read_yolo(tmp_path)
     (tmp_path / "data.yaml").write_text("names: [car\n")
-    with pytest.raises(DataError, match=r"data\.yaml: not YAML \(while parsing a flow sequence"):
+    with pytest.raises(DataError, match=r"data\.yaml: not YAML \(line 2: while parsing a flow sequence"):
         read_yolo(tmp_path)
 
 
