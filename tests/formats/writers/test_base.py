@@ -211,3 +211,20 @@ def test_a_full_disk_leaves_whole_frames_in_files_that_grow(name: str, tmp_path:
         with pytest.raises(OutputError, match="gap"):
             writer.write(video[2])
     assert {path: path.read_bytes() for path in writer.files} == before
+
+
+@pytest.mark.parametrize(
+    ("name", "file"), [("csv", "boxes.csv"), ("csv", "frames.csv"), ("jsonl", "perceptions.jsonl")]
+)
+def test_a_first_frame_that_cannot_be_written_replaces_nothing(
+    name: str, file: str, tmp_path: Path, video: list[Perception]
+) -> None:
+    with open_writer(name, tmp_path) as writer:
+        writer.write(video[0])
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    (tmp_path / f"{file}.part").mkdir()
+    with open_writer(name, tmp_path, overwrite=True) as writer, pytest.raises(OSError, match=file):
+        writer.write(video[1])
+    assert writer.files == []
+    (tmp_path / f"{file}.part").rmdir()
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before

@@ -250,11 +250,11 @@ def uninterrupted() -> Iterator[None]:
 class GrowingFile:
     """A text file that is whole after each addition: one that cannot be written in full is taken back.
 
-    The first addition makes it, and replaces what is there.
+    With the first addition that is kept it has its name, and replaces what is there.
 
     Args:
         path: The file; its folder exists.
-        files: Takes the path when the file is made.
+        files: Takes the path when the file has its name.
         head: Text before the first addition.
     """
 
@@ -273,8 +273,7 @@ class GrowingFile:
         """
         try:
             if self._handle is None:
-                self._handle = io.FileIO(self.path, "w")
-                self._files.append(self.path)
+                self._handle = io.FileIO(part_of(self.path), "w")
                 text = self._head + text
             rest = text.encode()
             self._before, self._end = self._end, self._end + len(rest)
@@ -285,6 +284,12 @@ class GrowingFile:
             error.filename = str(self.path)
             raise
 
+    def keep(self) -> None:
+        """Let the last addition stay."""
+        if self.path not in self._files:
+            part_of(self.path).replace(self.path)
+            self._files.append(self.path)
+
     def take_back(self) -> None:
         """Forget the last addition, and with the first the file, and end it."""
         if self._handle is None:
@@ -292,14 +297,14 @@ class GrowingFile:
         if self._before:
             self._handle.truncate(self._before)
         else:
-            self.path.unlink(missing_ok=True)
-            self._files.remove(self.path)
+            part_of(self.path).unlink(missing_ok=True)
         self._handle.close()
 
     def close(self) -> None:
         """End the file. Without any addition one that is there stays as it is, else it is made of the head alone."""
         if self._handle is None and not self.path.exists():
             self.add("")
+            self.keep()
         if self._handle is not None:
             self._handle.close()
 

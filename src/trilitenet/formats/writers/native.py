@@ -86,6 +86,7 @@ class JsonLinesWriter(Writer):
     def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
         """Write one line."""
         self._file.add(f"{dumps(to_document(perception, road))}\n")
+        self._file.keep()
 
     def _close(self) -> None:
         """Close the file."""

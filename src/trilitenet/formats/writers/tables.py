@@ -125,6 +125,8 @@ class CsvWriter(Writer):
         except OSError:
             self._frames.take_back()
             raise
+        self._frames.keep()
+        self._boxes.keep()
 
     def _close(self) -> None:
         """Close the files."""
