@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from trilitenet.data.records import CocoRuns, ImageRecord, ListedRecords, RowRuns, image_size
+from trilitenet.data.records import CocoRuns, ImageRecord, ListedRecords, RowRuns, image_size, name_apart
 from trilitenet.errors import DataError
 from trilitenet.processing.serialise import encode_mask
 
@@ -53,6 +53,22 @@ def test_runs_that_do_not_fit_are_refused(runs: CocoRuns | RowRuns) -> None:
 def test_a_damaged_exif_leaves_the_size_readable(tmp_path: Path, exif: bytes) -> None:
     Image.new("RGB", (60, 40)).save(tmp_path / "a.png", exif=exif)
     assert image_size(tmp_path / "a.png") == (40, 60)
+
+
+@pytest.mark.parametrize(
+    ("images", "names"),
+    [
+        (["x/1.jpg", "x/2.jpg"], ["1", "2"]),
+        (["x/1.jpg", "y/1.png", "y/2.jpg"], ["x-1", "y-1", "2"]),
+        (["a/x/1.jpg", "b/x/1.jpg", "b/y/1.jpg"], ["a-x-1", "b-x-1", "y-1"]),
+        (["/1.jpg", "/x/1.jpg"], ["1", "x-1"]),
+        (["x/1.jpg", "x/1.png", "y/1.jpg"], ["1", "1", "y-1"]),
+        (["x/y-1.jpg", "y/1.jpg", "z/1.jpg"], ["x-y-1", "y-1", "z-1"]),
+        (["p/x/1.jpg", "p/x/1.jpg"], ["1"]),
+    ],
+)
+def test_images_of_one_name_get_their_folders(images: list[str], names: list[str]) -> None:
+    assert list(name_apart(map(Path, images)).values()) == names
 
 
 def test_two_images_of_one_name_are_both_named() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -28,6 +29,8 @@ __all__ = [
     "RowRuns",
     "RunLabel",
     "image_size",
+    "name_apart",
+    "named_apart",
     "same_name",
 ]
 
@@ -225,6 +228,36 @@ def image_size(path: Path) -> tuple[int, int]:
             return upright_size(image)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise DataError(f"{path}: not an image that can be read ({error})") from error
+
+
+def name_apart(images: Iterable[Path]) -> dict[Path, str]:
+    """Return each image's name: its stem, after as many of its folders as tell it from the others (``day1-0001``).
+
+    Images that differ in their ending alone have one name.
+    """
+    depths = dict.fromkeys(images, 0)
+    alike = Counter(path.with_suffix("") for path in depths)
+    while True:
+        names = {path: "-".join((*path.parts[-1 - depth : -1], path.stem)) for path, depth in depths.items()}
+        counts = Counter(names.values())
+        longer = [
+            path
+            for path, name in names.items()
+            if counts[name] > 1
+            and alike[path.with_suffix("")] == 1
+            and depths[path] < len(path.relative_to(path.anchor).parent.parts)
+        ]
+        if not longer:
+            return names
+        for path in longer:
+            depths[path] += 1
+
+
+def named_apart(records: Iterable[ImageRecord]) -> list[ImageRecord]:
+    """Return the records of a split with the names that `name_apart` gives their images."""
+    records = list(records)
+    names = name_apart(record.image for record in records)
+    return [dataclasses.replace(record, name=names[record.image]) for record in records]
 
 
 def same_name(name: str, split: str, one: Path, two: Path) -> DataError:

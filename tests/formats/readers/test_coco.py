@@ -259,3 +259,15 @@ def test_areas_of_too_few_points_are_counted(tmp_path: Path) -> None:
     write(tmp_path / "labels.json", coco(annotations=[area]))
     report = convert(read_coco(tmp_path, LabelMapping(drivable=("road",))), tmp_path / "out")
     assert report.dropped["train"] == {"area with too few points": 3}
+
+
+def test_images_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    images = []
+    for number, folder in enumerate(("monday", "tuesday"), start=7):
+        (tmp_path / folder).mkdir()
+        write(tmp_path / folder / "one.png")
+        images.append({**coco()["images"][0], "id": number, "file_name": f"{folder}/one.png"})
+    write(tmp_path / "labels.json", coco(images=images))
+    source = read_coco(tmp_path, LabelMapping(classes=CLASSES))
+    assert source.names("train") == ["monday-one", "tuesday-one"]
+    assert [len(source.record("train", name).objects or ()) for name in source.names("train")] == [5, 0]

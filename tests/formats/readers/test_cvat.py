@@ -173,3 +173,13 @@ def test_labels_that_all_mean_nothing_are_refused(tmp_path: Path) -> None:
         read_shapes(tmp_path, box.format("Car"), LabelMapping())
     assert read_shapes(tmp_path, box.format("Car") + box.format("car"), LabelMapping()).objects
     assert read_shapes(tmp_path, "", LabelMapping()).objects is None
+
+
+def test_images_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    lines = []
+    for folder in ("monday", "tuesday"):
+        (tmp_path / folder).mkdir()
+        cv2.imwrite(str(tmp_path / folder / "one.png"), np.zeros((*SIZE, 3), np.uint8))
+        lines.append(f'<image name="{folder}/one.png" width="80" height="48"><tag label="road"/></image>')
+    (tmp_path / "annotations.xml").write_text(f"<annotations>{''.join(lines)}</annotations>")
+    assert read_cvat(tmp_path, LabelMapping(drivable=("road",))).names("train") == ["monday-one", "tuesday-one"]

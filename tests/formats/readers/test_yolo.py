@@ -121,10 +121,19 @@ def test_labels_that_are_not_utf8_or_no_numbers(root: Path) -> None:
         read_yolo(root).record("train", "a")
 
 
-@pytest.mark.parametrize("other", ["images/train/more/a.jpg", "images/train/a.png"])
-def test_images_of_one_name_are_refused(root: Path, other: str) -> None:
-    (root / other).parent.mkdir(exist_ok=True)
-    cv2.imwrite(str(root / other), np.zeros((*SIZE, 3), np.uint8))
+def test_images_of_one_name_are_told_apart_by_their_folders(root: Path) -> None:
+    for folder, label in (("one", "0 0.5 0.5 0.5 0.5\n"), ("two", "")):
+        (root / "images/train" / folder).mkdir()
+        (root / "labels/train" / folder).mkdir()
+        cv2.imwrite(str(root / "images/train" / folder / "c.png"), np.zeros((*SIZE, 3), np.uint8))
+        (root / "labels/train" / folder / "c.txt").write_text(label)
+    source = read_yolo(root)
+    assert [name for name in source.names("train") if "c" in name] == ["one-c", "two-c"]
+    assert [len(source.record("train", name).objects or ()) for name in ("one-c", "two-c")] == [1, 0]
+
+
+def test_images_of_one_name_and_folder_are_refused(root: Path) -> None:
+    cv2.imwrite(str(root / "images/train/a.png"), np.zeros((*SIZE, 3), np.uint8))
     with pytest.raises(DataError, match=r"two images are called 'a' in split 'train': .*a\.\w+ and .*a\.\w+; rename"):
         read_yolo(root)
 

@@ -23,6 +23,7 @@ from trilitenet.data.records import (
     LaneLabel,
     ListedRecords,
     ObjectLabel,
+    named_apart,
 )
 from trilitenet.errors import DataError, brief
 from trilitenet.formats.readers.mapping import SPLIT_NAMES, LabelMapping, Shapes, find_image, read_json
@@ -61,7 +62,7 @@ def read_coco(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
     mapping.check_categories(categories, root)
     if unused:
         found.append(f"not used: {', '.join(path.name for path in unused)}")
-    splits = {split: items for split, items in records.items() if items}
+    splits = {split: named_apart(items) for split, items in records.items() if items}
     return ListedRecords(splits, tuple(found), mapping.origin("coco", root))
 
 

@@ -15,7 +15,16 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.data.records import AreaLabel, BrokenRecord, ImageRecord, LaneLabel, ListedRecords, ObjectLabel, RowRuns
+from trilitenet.data.records import (
+    AreaLabel,
+    BrokenRecord,
+    ImageRecord,
+    LaneLabel,
+    ListedRecords,
+    ObjectLabel,
+    RowRuns,
+    named_apart,
+)
 from trilitenet.errors import DataError, brief
 from trilitenet.formats.readers.mapping import SPLIT_NAMES, LabelMapping, Shapes, find_image, hull
 
@@ -68,7 +77,8 @@ def read_cvat(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
         found.append(f"{missing} listed images are not there")
     if videos:
         found.append(f"files of the kind 'CVAT for video', left out: {videos}")
-    return ListedRecords(records, tuple(found), mapping.origin("cvat", root))
+    splits = {split: named_apart(items) for split, items in records.items()}
+    return ListedRecords(splits, tuple(found), mapping.origin("cvat", root))
 
 
 def _read_file(

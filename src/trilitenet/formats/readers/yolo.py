@@ -14,7 +14,7 @@ import numpy as np
 
 from trilitenet.config import Task, read_yaml
 from trilitenet.data.reading import IMAGE_ENDINGS
-from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ObjectLabel, image_size, same_name
+from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ObjectLabel, image_size, name_apart, same_name
 from trilitenet.errors import ConfigError, DataError, brief
 from trilitenet.formats.readers.mapping import LabelMapping, Shapes, hull
 
@@ -134,7 +134,7 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
             base = path.parent
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise DataError(f"{path}: not a YOLO data file ({brief(error)})") from error
-    images: dict[str, dict[str, Path]] = defaultdict(dict)
+    listed: dict[str, list[Path]] = defaultdict(list)
     missing: Counter[str] = Counter()
     looked: dict[Path, None] = {}
     for key, split in (("train", "train"), ("val", "val"), ("valid", "val"), ("test", "test")):
@@ -147,11 +147,15 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
             for image in _images_at(candidates):
                 if not image.is_file():
                     missing[split] += 1
-                elif images[split].setdefault(image.stem, image) != image:
-                    raise same_name(image.stem, split, images[split][image.stem], image)
+                else:
+                    listed[split].append(image)
     if content.get("train") == content.get("val"):
-        images.pop("val", None)
-    images = {split: items for split, items in images.items() if items}
+        listed.pop("val", None)
+    images: dict[str, dict[str, Path]] = defaultdict(dict)
+    for split, paths in listed.items():
+        for image, name in name_apart(paths).items():
+            if images[split].setdefault(name, image) != image:
+                raise same_name(name, split, images[split][name], image)
     if not images:
         words = f"looked in {', '.join(map(str, looked))}" if looked else "it names no folder as train, val or test"
         raise DataError(f"{path}: no images; {words}")
