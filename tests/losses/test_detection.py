@@ -236,6 +236,16 @@ def test_complete_iou_of_equal_boxes_is_one() -> None:
     assert float(complete_iou(box, box)) == pytest.approx(1.0, abs=1e-6)
 
 
+def test_complete_iou_of_equal_boxes_of_any_size_is_finite() -> None:
+    targets = torch.rand(1000, 4, generator=torch.Generator().manual_seed(0)) * 50 + 1
+    boxes = targets.clone().requires_grad_()
+    overlap = complete_iou(boxes, targets)
+    overlap.sum().backward()
+    torch.testing.assert_close(overlap, torch.ones(1000), atol=1e-5, rtol=0)
+    assert boxes.grad is not None
+    assert boxes.grad.isfinite().all()
+
+
 def test_gradients_are_finite_and_right() -> None:
     outputs, boxes, ignored, labelled = random_case(3, 2, images=2)
     boxes, ignored = boxes[:4].clone(), ignored[:1].clone()

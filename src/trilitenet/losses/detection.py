@@ -132,7 +132,7 @@ def complete_iou(first: Tensor, second: Tensor, eps: float = 1e-7) -> Tensor:
     angle2 = torch.atan(size2[:, 0] / (size2[:, 1] + eps))
     aspect = (4 / math.pi**2) * (angle2 - angle1).square()
     with torch.no_grad():
-        weight = aspect / (1 + eps - iou + aspect)
+        weight = aspect / ((1 - iou).clamp(min=0) + aspect + eps)  # rounding may take IoU above 1
     return iou - distance - weight * aspect
 
 
