@@ -18,6 +18,7 @@ from trilitenet.deploy.layouts import LAYOUTS
 from trilitenet.errors import ConfigError, ShapeError
 from trilitenet.inference.openvino_backend import openvino_core
 from trilitenet.models.attention import PCAA
+from trilitenet.models.blocks import DepthwiseESP
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
 
 
@@ -63,6 +64,21 @@ def check(network: TriLiteNet, size: tuple[int, int] = (64, 128), batch: int = 1
 @pytest.mark.parametrize("variant", ["tiny", "small", "base"])
 def test_variants_and_layouts(variant: str, layout: str) -> None:
     check(lively_network(variant), layout=LAYOUTS[layout])
+
+
+@pytest.mark.parametrize("layout", ["pixels", "planar", "vectors-tiny"])
+@pytest.mark.parametrize("scale", [0.0, 1e-9])
+def test_a_channel_whose_normalisation_has_next_to_no_scale(scale: float, layout: str) -> None:
+    network = lively_network()
+    for block in network.encoder.level2:
+        assert isinstance(block, DepthwiseESP)
+        with torch.no_grad():
+            block.bn_act.bn.weight[3] = scale
+    check(network, layout=LAYOUTS[layout])
+    images = torch.randint(0, 256, (1, 64, 128, 3), dtype=torch.uint8)
+    graph = DeployGraph(network, LAYOUTS[layout])
+    wanted, half = graph(images), graph.reduced(torch.float16)(images)
+    assert relative_error(half.detection, wanted.detection) < 0.01
 
 
 @pytest.mark.parametrize("size", [(384, 640), (256, 448), (640, 640)])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
@@ -42,6 +42,9 @@ __all__ = [
     "fold_block",
     "recolumn",
 ]
+
+MOST_SHIFT: Final = 1e3
+"""A normalisation's shift over its scale, above which half precision loses what the shift is added to."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -280,7 +283,7 @@ class DepthwiseESPGraph(nn.Module):
     BN(x + T D y) = s (x + T D y + shift / s): the shift over the scale is the bias of the merging 1x1; the scale stays
     behind the sum, where runtimes fuse it with the activation. In cells of columns the residual is one more input of
     the merging 1x1 instead, with s on the diagonal: OpenVINO regroups the result of a convolution without a sum for
-    nothing, that of one with a sum by copying.
+    nothing, that of one with a sum by copying. So it is where a scale is so small that the shift cannot be over it.
 
     Args:
         block: The network's.
@@ -299,7 +302,7 @@ class DepthwiseESPGraph(nn.Module):
         matrix = hierarchical_sum_matrix(len(pointwise[0]), len(pointwise[1])) @ torch.block_diag(*pointwise)
         scale, shift = batch_norm_affine(block.bn_act.bn)
         slopes = prelu_slopes(block.bn_act.act, len(scale))
-        self.joined = columns > 1
+        self.joined = columns > 1 or not bool((shift.abs() < MOST_SHIFT * scale.abs()).all())
         if self.joined:
             matrix = torch.cat((matrix * scale.unsqueeze(1), torch.diag(scale)), 1)
             merge = Kernel(matrix.view(*matrix.shape, 1, 1), shift)
