@@ -19,6 +19,7 @@ from trilitenet.errors import ConfigError, ShapeError
 from trilitenet.inference.openvino_backend import openvino_core
 from trilitenet.models.attention import PCAA
 from trilitenet.models.blocks import DepthwiseESP
+from trilitenet.models.segmentation import SegmentationHead
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
 
 
@@ -168,6 +169,30 @@ def test_wrong_options_and_shapes() -> None:
         DeployGraph(network, masks="soft")  # type: ignore[arg-type]
     with pytest.raises(ShapeError, match="uint8"):
         DeployGraph(network)(torch.zeros(1, 3, 64, 64))
+
+
+def test_a_network_of_other_layers_is_refused() -> None:
+    network = lively_network()
+    network.encoder.pool = torch.nn.MaxPool2d(3, 2, 1)  # type: ignore[assignment]
+    with pytest.raises(ConfigError, match=r"not encoder\.pool \(MaxPool2d\)"):
+        DeployGraph(network)
+
+
+def test_hooks_are_refused() -> None:
+    network = lively_network()
+    assert network.lane is not None
+    hook = network.lane.register_forward_hook(lambda _layer, _inputs, output: 2 * output)
+    with pytest.raises(ConfigError, match="the hooks of lane"):
+        DeployGraph(network)
+    hook.remove()
+    check(network)
+
+
+def test_wider_heads_and_more_blocks() -> None:
+    network = lively_network()
+    network.encoder.level2.append(DepthwiseESP(16))
+    network.lane = SegmentationHead(8, 8, 16)
+    check(network.eval())
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit.trace:DeprecationWarning")

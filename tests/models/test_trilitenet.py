@@ -9,13 +9,17 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from tests.models.conftest import published_state
 from trilitenet import build_network, load_network
 from trilitenet.config import IMAGE_MEAN, IMAGE_STD, TASKS, VARIANTS
 from trilitenet.errors import ConfigError, ShapeError
+from trilitenet.models.attention import PCAA
+from trilitenet.models.blocks import ConvBNPReLU, DepthwiseESP, DilatedConv
 from trilitenet.models.cost import count_multiply_adds, count_parameters
-from trilitenet.models.trilitenet import NetworkOutputs, normalise_images
+from trilitenet.models.segmentation import SegmentationHead
+from trilitenet.models.trilitenet import NetworkOutputs, foreign_layers, normalise_images
 from trilitenet.models.weights import import_published
 
 SUBSETS = [("detection",), ("drivable",), ("lane",), ("detection", "lane"), ("drivable", "lane"), TASKS]
@@ -157,3 +161,49 @@ def test_what_is_given_is_left_as_it_is() -> None:
     count_multiply_adds(network, (64, 64))
     assert network.training
     assert not network.encoder.training
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("part", ["pcaa", "litepan", "spp"])
+def test_no_layer_of_a_network_as_built_is_foreign(variant: str, part: str) -> None:
+    left_out: dict[str, Any] = {part: False}
+    assert foreign_layers(build_network(variant, 3, **left_out)) == []
+
+
+def test_widths_and_the_number_of_blocks_are_free() -> None:
+    network = build_network("tiny")
+    network.encoder.level2.append(DepthwiseESP(16))
+    network.lane = SegmentationHead(8, 8, 16)
+    assert foreign_layers(network) == []
+
+
+class Scaled(PCAA):
+    """Attention of other arithmetic with the same tensors."""
+
+
+@pytest.mark.parametrize(
+    ("name", "layer"),
+    [
+        ("pcaa", Scaled(64)),
+        ("encoder.pool", nn.MaxPool2d(3, 2, 1)),
+        ("encoder.level1.act", nn.ReLU()),
+        ("encoder.b1", nn.Sequential(ConvBNPReLU(7, 8), ConvBNPReLU(8, 8))),
+        ("encoder.b1.bn", nn.BatchNorm2d(8)),  # another eps
+        ("encoder.level2.0.d2.depthwise", DilatedConv(3, 3, 3, dilation=2)),  # dense
+        ("encoder.b1.conv", nn.Conv2d(7, 8, 3, padding=1, padding_mode="reflect", bias=False)),
+        ("reduce.conv", nn.Conv2d(64, 16, 3, padding=1, groups=2, bias=False)),
+        ("lane.out.deconv", nn.ConvTranspose2d(4, 2, 2, 2)),  # with a bias
+    ],
+)
+def test_layers_that_compute_something_else_are_named(name: str, layer: nn.Module) -> None:
+    network = build_network("tiny")
+    outer, _, last = name.rpartition(".")
+    setattr(network.get_submodule(outer), last, layer)
+    assert foreign_layers(network) == [f"{name} ({type(layer).__name__})"]
+
+
+def test_a_forward_of_its_own_is_named() -> None:
+    network = build_network("tiny")
+    assert network.pcaa is not None
+    network.pcaa.forward = lambda x: x  # type: ignore[method-assign]
+    assert foreign_layers(network) == ["pcaa (PCAA)"]

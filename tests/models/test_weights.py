@@ -13,6 +13,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
+from torch import nn
 
 from tests.models.conftest import published_state
 from trilitenet import build_network, load_network
@@ -90,6 +91,17 @@ def test_a_damaged_state_is_never_loaded(saved: Path, change: str) -> None:
     expected = {"missing": "missing drivable", "surplus": "surplus extra", "shape": "must be", "nan": "not finite"}
     with pytest.raises(WeightsError, match=expected[change]):
         load_network(saved)
+
+
+def test_weights_of_other_layers_are_not_loaded_as_those_of_ours(tmp_path: Path) -> None:
+    network = build_network("tiny")
+    network.encoder.pool = nn.MaxPool2d(3, 2, 1)  # type: ignore[assignment]
+    path = tmp_path / "net.safetensors"
+    save_network(network, path, network.card)
+    assert read_card(path).variant == "tiny"
+    with pytest.raises(WeightsError, match=r"does not make: encoder\.pool \(MaxPool2d\)"):
+        load_network(path)
+    assert network.load_state_dict(load_file(path), strict=False).unexpected_keys == []
 
 
 def test_files_that_are_not_weights(tmp_path: Path, saved: Path) -> None:

@@ -53,7 +53,7 @@ from trilitenet.errors import ConfigError, ShapeError
 from trilitenet.models.attention import BINS, PCAA
 from trilitenet.models.detection import DetectionHead, LitePAN
 from trilitenet.models.segmentation import SegmentationHead, UpStage
-from trilitenet.models.trilitenet import TriLiteNet
+from trilitenet.models.trilitenet import TriLiteNet, foreign_layers
 
 __all__ = ["MASKS", "DeployGraph", "DeployOutputs", "Masks", "Traceable"]
 
@@ -363,7 +363,8 @@ class DeployGraph(nn.Module):
     It equals the network in float32 to rounding: relative error below 1e-5, and more than 0.99999 of mask pixels.
 
     Args:
-        network: What to rewrite: any variant, tasks, classes and blocks. It is not changed.
+        network: What to rewrite: any variant, tasks, classes, blocks and widths, of the layers that
+            `trilitenet.build_network` makes. It is not changed.
         layout: How to lay it out; all layouts compute the same function.
         masks: What a mask holds.
         mask_scale: 2 doubles masks inside the graph (bilinear, before the decision), so that a 1280 x 720 frame on
@@ -372,7 +373,7 @@ class DeployGraph(nn.Module):
         thresholds: Mask thresholds that "decision" and "logit" use; the card's if left out.
 
     Raises:
-        ConfigError: If the options do not fit each other.
+        ConfigError: If the options do not fit each other, or the network has other layers or hooks.
     """
 
     def __init__(
@@ -390,6 +391,7 @@ class DeployGraph(nn.Module):
             raise ConfigError(f"unknown masks {masks!r}; known: {', '.join(MASKS)}")
         if mask_scale not in (1, 2) or (mask_scale == 2 and masks != "decision"):
             raise ConfigError(f"mask_scale is 1, or 2 with masks='decision'; got {mask_scale} with {masks!r}")
+        _check_layers(network)
         thresholds = thresholds or network.card.thresholds
         self.layout = layout = layout or Layout()
         encoder = network.encoder
@@ -547,6 +549,22 @@ class DeployGraph(nn.Module):
         batch, height, width, _ = image.shape
         x = image.reshape(batch, height, -1).float() * self.scale.repeat(width) + self.shift.repeat(width)
         return x.view(batch, height, width, 3).permute(0, 3, 1, 2)
+
+
+def _check_layers(network: TriLiteNet) -> None:
+    """Refuse a network whose weights are not all that it computes by: the rewrites read nothing else."""
+    foreign = foreign_layers(network)
+    if foreign:
+        raise ConfigError(
+            f"the deploy graph knows the layers of trilitenet.build_network alone, not {', '.join(foreign)}; run the "
+            "network itself on PyTorch"
+        )
+    hooked = [name for name, layer in network.named_modules() if layer._forward_hooks or layer._forward_pre_hooks]
+    if hooked:
+        raise ConfigError(
+            f"the deploy graph would leave out the hooks of {', '.join(name or 'the network' for name in hooked)}; "
+            "remove them first (those of pruning with torch.nn.utils.prune.remove)"
+        )
 
 
 class Traceable(nn.Module):

@@ -6,8 +6,10 @@ paper leaves out follows the authors' public code, https://github.com/chequanghu
 
 from __future__ import annotations
 
+import functools
+import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, Final, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -28,12 +30,12 @@ from trilitenet.config import (
 )
 from trilitenet.errors import ConfigError, ShapeError
 from trilitenet.models.attention import PCAA
-from trilitenet.models.blocks import ConvBNPReLU
+from trilitenet.models.blocks import ConvBNPReLU, DepthwiseConv
 from trilitenet.models.detection import SPP, DetectionHead, LitePAN, decode_level
 from trilitenet.models.encoder import Encoder
 from trilitenet.models.segmentation import SegmentationHead
 
-__all__ = ["NetworkOutputs", "TriLiteNet", "build_network", "normalise_images"]
+__all__ = ["NetworkOutputs", "TriLiteNet", "build_network", "foreign_layers", "normalise_images"]
 
 
 class NetworkOutputs(NamedTuple):
@@ -181,6 +183,49 @@ def build_network(
     blocks = tuple(name for name, on in (("pcaa", pcaa), ("litepan", litepan), ("spp", spp)) if on)
     return TriLiteNet(
         variant, classes, check_tasks(tuple(tasks)), blocks, DEFAULT_ANCHORS if anchors is None else anchors
+    )
+
+
+_KIND: Final = (
+    "kernel_size", "stride", "padding", "output_padding", "dilation", "padding_mode", "ceil_mode", "count_include_pad",
+    "divisor_override", "eps", "affine", "track_running_stats",
+)  # fmt: skip
+"""What a layer computes beside its tensors' shapes: attributes that its type alone does not fix."""
+
+
+def foreign_layers(network: nn.Module) -> list[str]:
+    """Name the layers that are not of the kind that `build_network` makes in their place; none if all are.
+
+    Widths and the number of Depth-wise ESP blocks are free: tensors tell them. All else that a layer computes is known
+    from `build_network` alone, to a file of weights and to the deploy graph.
+
+    Returns:
+        For each such layer its name and what it is, as ``"encoder.pool (MaxPool2d)"``; layers inside one are left out.
+    """
+    known = _own_layers()
+    found: dict[str, str] = {}
+    for name, layer in network.named_modules():
+        place = re.sub(r"^(encoder\.level[23]\.)\d+", r"\g<1>0", name)
+        if "forward" in vars(layer) or _kind(layer) != known.get(place):
+            inside = any(name.startswith(f"{outer}." if outer else "") for outer in found)
+            if not inside:
+                found[name] = f"{name or 'the network'} ({type(layer).__name__})"
+    return list(found.values())
+
+
+@functools.cache
+def _own_layers() -> dict[str, tuple[Any, ...]]:
+    with torch.device("meta"):
+        return {name: _kind(layer) for name, layer in build_network("tiny").named_modules()}
+
+
+def _kind(layer: nn.Module) -> tuple[Any, ...]:
+    grouped = getattr(layer, "groups", 1) > 1 and not isinstance(layer, DepthwiseConv)
+    return (
+        type(layer),
+        grouped,
+        getattr(layer, "bias", None) is None,
+        *(getattr(layer, name, None) for name in _KIND),
     )
 
 

@@ -32,7 +32,7 @@ from trilitenet.config import (
     shipped_weights,
 )
 from trilitenet.errors import ConfigError, OutputError, WeightsError, replacing
-from trilitenet.models.trilitenet import TriLiteNet, build_network
+from trilitenet.models.trilitenet import TriLiteNet, build_network, foreign_layers
 
 __all__ = [
     "import_published",
@@ -78,6 +78,9 @@ _RENAMES: Final = (
 )
 """Published key prefixes and ours; the first match wins."""
 
+_FOREIGN_KEY: Final = "trilitenet.foreign_layers"
+"""Key, in a file's metadata, of the layers that `build_network` does not make; absent where there are none."""
+
 _TRAINING_STATE: Final = frozenset({"schema", "config", "network", "optimiser"})
 """Keys that tell the training state of `trilitenet train` from other pickles."""
 
@@ -103,6 +106,8 @@ def resolve_weights(model: str | os.PathLike[str]) -> Path:
 
 def save_network(network: TriLiteNet, path: str | os.PathLike[str], card: ModelCard, *, half: bool = False) -> None:
     """Write weights and card to one safetensors file, atomically.
+
+    A network with layers that `build_network` does not make is written too, but `load_network` refuses the file.
 
     Args:
         network: What to save; its anchors replace the card's.
@@ -136,10 +141,13 @@ def save_network(network: TriLiteNet, path: str | os.PathLike[str], card: ModelC
                 f"{path}: not written, {name} holds values that are not finite{' in fp16' if half else ''}"
             )
         tensors[name] = data
+    metadata = {CARD_KEY: card.to_json(), "format": "pt"}
+    if foreign := foreign_layers(network):
+        metadata[_FOREIGN_KEY] = ", ".join(foreign)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as part:
-            save_file(tensors, part, metadata={CARD_KEY: card.to_json(), "format": "pt"})
+            save_file(tensors, part, metadata=metadata)
     except (OSError, SafetensorError) as error:
         raise OutputError(f"{path}: cannot write the weights ({error})") from error
 
@@ -165,8 +173,8 @@ def load_network(path: str | os.PathLike[str]) -> TriLiteNet:
         The network, with its ``card``.
 
     Raises:
-        WeightsError: If the file is missing, broken, foreign, of a newer layout, or if any tensor is missing,
-            surplus, misshapen or not finite.
+        WeightsError: If the file is missing, broken, foreign, of a newer layout or of a network with other layers, or
+            if any tensor is missing, surplus, misshapen or not finite.
     """
     path = resolve_weights(path)
     card, tensors = _open(path, tensors=True)
@@ -250,6 +258,11 @@ def _open(path: Path, *, tensors: bool) -> tuple[ModelCard, dict[str, Tensor]]:
                 raise WeightsError(f"{path}: is safetensors, but has no trilitenet card; it is another model's")
             card = ModelCard.from_json(metadata[CARD_KEY], str(path))
             get_variant(card.variant)
+            if tensors and _FOREIGN_KEY in metadata:
+                raise WeightsError(
+                    f"{path}: is of a network with layers that build_network does not make: {metadata[_FOREIGN_KEY]}; "
+                    "build that network and give it the tensors of safetensors.torch.load_file"
+                )
             keys = list(file.keys()) if tensors else []
             return card, {key: file.get_tensor(key) for key in keys}
     except SafetensorError as error:
