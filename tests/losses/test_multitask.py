@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from trilitenet.config import DEFAULT_ANCHORS
+from trilitenet.errors import ConfigError
 from trilitenet.losses.detection import DetectionLoss
 from trilitenet.losses.multitask import MultiTaskLoss
 from trilitenet.losses.segmentation import SegmentationLoss
@@ -129,3 +130,8 @@ def test_uncertainty_weighting_learns_nothing_of_boxes_that_nobody_labelled() ->
     assert parameter.grad is not None
     assert parameter.grad[0] == 0
     assert (parameter.grad[1:] != 0).all()
+
+
+def test_a_balancing_that_is_none_is_refused() -> None:
+    with pytest.raises(ConfigError, match="unknown balancing 'learned'; known: fixed, uncertainty"):
+        MultiTaskLoss(None, balancing="learned")  # type: ignore[arg-type]

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol, TypeAlias, get_args
 
 import torch
 from torch import Tensor, nn
 
+from trilitenet.errors import ConfigError, did_you_mean
 from trilitenet.losses.detection import DetectionLoss
 from trilitenet.losses.segmentation import IGNORED, SegmentationLoss
 
 __all__ = ["LossTerms", "MultiTaskLoss", "Outputs", "Targets"]
+
+Balancing: TypeAlias = Literal["fixed", "uncertainty"]
 
 
 class Outputs(Protocol):
@@ -80,6 +83,9 @@ class MultiTaskLoss(nn.Module):
         weights: Of detection, drivable area and lane.
         balancing: ``"fixed"`` keeps the weights; ``"uncertainty"`` learns a log-variance s a task (Kendall et al.,
             2018): the sum of weight x exp(-s) x loss + s. Only that has parameters, which the optimiser must be given.
+
+    Raises:
+        ConfigError: If the balancing is unknown.
     """
 
     def __init__(
@@ -89,13 +95,15 @@ class MultiTaskLoss(nn.Module):
         lane: SegmentationLoss | None = None,
         *,
         weights: tuple[float, float, float] = (1.0, 0.3, 0.3),
-        balancing: Literal["fixed", "uncertainty"] = "fixed",
+        balancing: Balancing = "fixed",
     ) -> None:
         super().__init__()
         self.detection = detection
         self.drivable = drivable or SegmentationLoss(0.7, 0.3)
         self.lane = lane or SegmentationLoss(0.9, 0.1)
         self.weights = weights
+        if balancing not in get_args(Balancing):
+            raise ConfigError(f"unknown balancing {balancing!r}{did_you_mean(balancing, get_args(Balancing))}")
         self.log_variance = nn.Parameter(torch.zeros(3)) if balancing == "uncertainty" else None
 
     def forward(self, outputs: Outputs, batch: Targets) -> LossTerms:
