@@ -233,6 +233,13 @@ def test_what_does_not_fit_is_refused_and_nothing_of_it_is_kept(metric: Detectio
     assert len(metric) == 0
 
 
+def test_plain_empty_lists_are_no_boxes() -> None:
+    metric = DetectionMetric()
+    assert metric.update([], [], [], [[0, 0, 10, 10]], [0]) == (0, 0, 1)  # type: ignore[arg-type]
+    assert metric.update([], [], [], [], []) == (0, 0, 0)  # type: ignore[arg-type]
+    assert metric.compute().objects == 1
+
+
 def test_a_box_at_the_very_overlap_is_right_and_one_at_the_very_confidence_does_not_count() -> None:
     truth = np.array([[0, 0, 10, 10]], np.float32)
     half = np.array([[0, 0, 10, 5]], np.float32)

@@ -231,3 +231,10 @@ def test_impossible_input_is_refused() -> None:
         PublishedSegmentation(0)
     with pytest.raises(ShapeError, match="2 predicted boxes have 1 scores"):
         PublishedDetection().update(np.ones((2, 4)), np.ones(1), np.zeros(2), NO_BOXES, NO_CLASS)
+
+
+def test_plain_empty_lists_are_no_boxes() -> None:
+    metric = PublishedDetection()
+    metric.update([], [], [], [[0, 0, 10, 10]], [0])  # type: ignore[arg-type]
+    metric.update([], [], [], [], [])  # type: ignore[arg-type]
+    assert (metric.compute().objects, metric.compute().images) == (1, 2)

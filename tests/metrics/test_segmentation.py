@@ -94,3 +94,9 @@ def test_other_types_are_refused_not_cast() -> None:
     for valid in (np.full((4, 4), 255, np.uint8), np.ones((2, 2), np.bool_)):
         with pytest.raises(ShapeError, match="valid must be"):
             SegmentationMetric().update(truth, truth, valid)  # type: ignore[arg-type]
+
+
+def test_masks_of_a_batch_are_refused() -> None:
+    masks = np.ones((1, 4, 4), np.bool_)
+    with pytest.raises(ShapeError, match=r"must be \(H, W\)"):
+        SegmentationMetric().update(masks, masks)

@@ -235,6 +235,7 @@ class DetectionMetric:
         if boxes is None or scores is None or class_id is None or truth is None or truth_class is None:
             self._objects.append(objects.ravel())
             return None
+        boxes = np.asarray(boxes, np.float64).reshape(-1, 4)
         regions = np.zeros((0, 4)) if ignored is None else np.asarray(ignored, np.float64).reshape(-1, 4)
         pardoned = np.zeros(len(boxes), np.bool_) if neutral is None else np.asarray(neutral, np.bool_)
         order = np.argsort(-np.asarray(scores, np.float32), kind="stable")
@@ -244,7 +245,7 @@ class DetectionMetric:
             objects[number] = self._in_range(box_area(true)).sum(axis=1)
             if not len(picked):
                 continue
-            matched, passed = self._match(np.asarray(boxes, np.float64)[picked], true, regions, pardoned[picked])
+            matched, passed = self._match(boxes[picked], true, regions, pardoned[picked])
             self._scores.append(np.asarray(scores, np.float32)[picked, None])
             self._image.append(np.full((len(picked), 1), index))
             self._class.append(np.full((len(picked), 1), number))
@@ -253,7 +254,7 @@ class DetectionMetric:
         self._objects.append(objects.ravel())
         kept = order[np.asarray(scores)[order] > self.confidence]
         return self._confuse(
-            np.asarray(boxes, np.float64)[kept],
+            boxes[kept],
             np.asarray(class_id)[kept],
             truth,
             truth_class,

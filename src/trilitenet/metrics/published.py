@@ -265,13 +265,14 @@ class PublishedDetection:
             self._labelled.append(False)
             return
         order = np.argsort(-np.asarray(scores, np.float32), kind="stable")
-        boxes, scores, class_id = np.asarray(boxes)[order], np.asarray(scores)[order], np.asarray(class_id)[order]
+        boxes = np.asarray(boxes, np.float64).reshape(-1, 4)[order]
+        scores, class_id = np.asarray(scores)[order], np.asarray(class_id)[order]
         right = np.zeros(len(boxes), np.uint16)
         bits = (1 << np.arange(len(self._thresholds))).astype(np.uint16)
         for number in np.unique(truth_class):
             targets = np.asarray(truth, np.float64)[np.asarray(truth_class) == number]
             picked = np.flatnonzero(np.asarray(class_id) == number)
-            overlap = box_overlap(np.asarray(boxes, np.float64)[picked], targets)
+            overlap = box_overlap(boxes[picked], targets)
             best = overlap.argmax(axis=1)
             value = overlap[np.arange(len(picked)), best]
             tries = np.flatnonzero(value > self._thresholds[0])

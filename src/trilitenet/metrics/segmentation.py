@@ -46,10 +46,10 @@ def as_binary(mask: NDArray[Any], valid: NDArray[np.bool_] | None = None) -> NDA
         valid: (H, W) bool.
 
     Raises:
-        ShapeError: If the mask is of another type, or ``valid`` of another type or size.
+        ShapeError: If the mask is of another shape or type, or ``valid`` of another type or size.
     """
-    if mask.dtype not in (np.bool_, np.uint8):
-        raise ShapeError(f"a mask must be bool or uint8, got {mask.dtype}")
+    if mask.ndim != 2 or mask.dtype not in (np.bool_, np.uint8):
+        raise ShapeError(f"a mask must be (H, W) bool or uint8, got {mask.shape} {mask.dtype}")
     check_valid(mask, valid)
     if mask.dtype == np.bool_:
         binary = np.ascontiguousarray(mask).view(np.uint8)
