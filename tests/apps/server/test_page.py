@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import jsonschema
 import numpy as np
 import pytest
 from PIL import Image
@@ -26,6 +27,7 @@ from tests.apps.server.conftest import TOKEN, FakeBackend, Running, encode, pict
 from trilitenet.apps.server.application import create_app
 from trilitenet.apps.server.problems import BusyError
 from trilitenet.apps.server.settings import Settings
+from trilitenet.formats.writers.native import read_schema
 from trilitenet.inference.predictor import Predictor
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -430,8 +432,10 @@ def test_a_clip_is_seen_in_chunks_with_progress(page: Page, server: Running, cli
     page.wait(lambda: page["seek-text"].text.startswith(f"{frames} /"))
     page["save-json"].click()
     saved = json.loads(page.downloaded("drive.json").read_text())
-    assert [entry["frame"] for entry in saved] == list(range(frames))
-    assert saved[5]["timestamp"] == 1.0
+    jsonschema.Draft202012Validator(read_schema()).validate(saved)
+    assert saved["source"] == "drive"
+    assert [entry["frame"] for entry in saved["frames"]] == list(range(frames))
+    assert saved["frames"][5]["timestamp"] == 1.0
     page["save-clip"].click()
     assert page.downloaded("drive.webm").read_bytes()[:4] == b"\x1a\x45\xdf\xa3"
 

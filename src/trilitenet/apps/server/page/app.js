@@ -257,7 +257,8 @@ function saveJson() {
     const place = frames.length > 1 ? { frame: index, timestamp: time } : {};
     return { ...perception, ...place, source: fileName, boxes };
   });
-  const text = JSON.stringify(shown.length === 1 ? shown[0] : shown, null, 1);
+  const whole = shown.length === 1 ? shown[0] : { schema: shown[0].schema, source: fileName, frames: shown };
+  const text = JSON.stringify(whole, null, 1);
   save(new Blob([text], { type: "application/json" }), ".json");
 }
 
