@@ -403,12 +403,15 @@ def _contrast(ink: str, back: str) -> float:
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three seconds in which the picture grows lighter."""
-    path = tmp_path_factory.mktemp("clip") / "drive.webm"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"VP80"), 10, (320, 192))
+    return _write_clip(tmp_path_factory.mktemp("clip") / "drive.webm", frames=30, rate=10)
+
+
+def _write_clip(path: Path, frames: int, rate: float) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"VP80"), rate, (320, 192))
     if not writer.isOpened():
         pytest.skip("this OpenCV cannot write WebM")
-    for index in range(30):
-        writer.write(np.full((192, 320, 3), 8 * index, np.uint8))
+    for index in range(frames):
+        writer.write(np.full((192, 320, 3), 8 * index % 256, np.uint8))
     writer.release()
     return path
 
@@ -467,6 +470,15 @@ def test_a_clip_can_be_stopped(page: Page, clip: Path) -> None:
     page["stop"].click()
     page.wait(lambda: not page["progress-row"].is_displayed())
     assert not page["error"].is_displayed()
+
+
+def test_a_clip_that_is_too_long_to_be_seen_whole_says_so(page: Page, tmp_path: Path) -> None:
+    page.script("document.getElementById('rate').value = '10'")
+    page.choose(_write_clip(tmp_path / "long.webm", frames=40, rate=1))
+    page.wait(lambda: "first 30 s of 40 s" in page["error"].text)
+    page["stop"].click()
+    page.wait(lambda: not page["stop"].is_displayed())
+    assert "fewer frames per second" in page["error"].text
 
 
 def _counted(server: Running, route: str) -> float:

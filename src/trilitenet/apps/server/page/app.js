@@ -198,6 +198,13 @@ async function seeClip(file, name, signal) {
   element("progress-text").textContent = "Opening the clip …";
   let chunk = [];
   for await (const frame of openClip(file, wanted, signal)) {
+    if (frame.index === 0 && frame.seconds * wanted >= frame.count + 1) {
+      const reach = (frame.count / wanted).toFixed(0);
+      showError(
+        `Only the first ${reach} s of ${frame.seconds.toFixed(0)} s are looked at: ${frame.count} frames are the most. ` +
+          "Choose fewer frames per second or a shorter clip.",
+      );
+    }
     chunk.push(frame);
     if (chunk.length < chunkSize && frame.index < frame.count - 1) continue;
     const results = await predictBatch(chunk.map((one) => one.blob), floor, signal);

@@ -42,7 +42,7 @@ function once(target, event, signal) {
   });
 }
 
-/** Yield { blob, picture, index, count, time } for frames of a clip, `rate` a second. */
+/** Yield { blob, picture, index, count, time, seconds } for frames of a clip `seconds` long, `rate` a second. */
 export async function* openClip(file, rate, signal) {
   const video = document.createElement("video");
   video.muted = true;
@@ -64,7 +64,7 @@ export async function* openClip(file, rate, signal) {
       video.currentTime = time + 1e-3;
       await seeked;
       const frame = await shrink(video, video.videoWidth, video.videoHeight, LONGEST.clip, 0.88);
-      yield { ...frame, index, count, time };
+      yield { ...frame, index, count, time, seconds: video.duration };
     }
   } finally {
     video.removeAttribute("src");
