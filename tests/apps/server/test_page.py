@@ -27,6 +27,7 @@ from tests.apps.server.conftest import TOKEN, FakeBackend, Running, encode, pict
 from trilitenet.apps.server.application import create_app
 from trilitenet.apps.server.problems import BusyError
 from trilitenet.apps.server.settings import Settings
+from trilitenet.config import Thresholds
 from trilitenet.formats.writers.native import read_schema
 from trilitenet.inference.predictor import Predictor
 
@@ -253,6 +254,20 @@ def test_the_slider_chooses_boxes(page: Page, photo: Path) -> None:
         counts[value] = page["objects-count"].get_attribute("textContent").strip()
     assert counts == {0.05: "(3)", 0.3: "(2)", 0.6: "(1)", 0.95: "(0)"}
     assert page["summary"].text.startswith("no vehicle;")
+
+
+def test_the_slider_begins_at_the_confidence_that_is_served(browser: Page, photo: Path) -> None:
+    predictor = Predictor(FakeBackend(), Thresholds(confidence=0.6062))
+    running = Running(create_app(predictor, "tiny", Settings(threads=1, drain=0.1)))
+    try:
+        browser.open(running.url)
+        assert browser["confidence"].get_attribute("value") == "0.6062"
+        assert browser["confidence-text"].text == "0.61"
+        assert browser.see(photo).startswith("1 vehicle;")
+        browser["confidence"].send_keys(Keys.HOME)
+        assert browser["confidence-text"].text == "0.06"
+    finally:
+        assert running.stop()
 
 
 def test_overlay_and_json_are_saved(page: Page, server: Running, photo: Path) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import io
 import json
 from typing import Any
@@ -197,6 +198,13 @@ def test_models_shows_the_card(client: TestClient) -> None:
     assert model["backend"] == "fake"
     assert model["card"]["licence"] == "MIT"
     assert (model["least_confidence"], model["max_images"]) == (0.0, 16)
+    assert model["confidence"] == model["card"]["thresholds"]["confidence"]
+
+
+def test_models_tells_the_confidence_that_is_served(backend: FakeBackend) -> None:
+    predictor = Predictor(backend, dataclasses.replace(backend.card.thresholds, confidence=0.6))
+    with TestClient(create_app(predictor, "tiny")) as client:
+        assert client.get("/v1/models").json()["models"][0]["confidence"] == 0.6
 
 
 def test_probes_follow_the_life_of_the_service(app: Application) -> None:

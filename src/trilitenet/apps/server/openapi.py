@@ -223,8 +223,8 @@ PREDICT_BATCH: Final[dict[str, Any]] = {
 MODELS: Final[dict[str, Any]] = {
     "responses": {
         200: {
-            "description": "The model card: variant, classes, thresholds, training data, figures, licence; the least "
-            "confidence that may be asked for, and images of one batch request.",
+            "description": "The model card: variant, classes, thresholds, training data, figures, licence; the "
+            "confidence above which boxes are kept, the least that may be asked for, and images of one batch request.",
             "content": {
                 "application/json": {
                     "example": {
@@ -234,6 +234,7 @@ MODELS: Final[dict[str, Any]] = {
                                 "name": "small",
                                 "backend": "openvino cpu",
                                 "ready": True,
+                                "confidence": 0.25,
                                 "least_confidence": 0.0,
                                 "max_images": 16,
                                 "card": {"variant": "small", "class_names": ["vehicle"]},

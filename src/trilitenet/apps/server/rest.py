@@ -86,6 +86,7 @@ def rest_router(service: Service) -> APIRouter:
             "name": service.name,
             "backend": service.predictor.backend.name,
             "ready": service.ready,
+            "confidence": service.predictor.thresholds.confidence,
             "least_confidence": service.predictor.least_confidence,
             "max_images": service.settings.max_images,
             "card": card,

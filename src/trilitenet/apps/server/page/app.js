@@ -125,15 +125,22 @@ async function meet() {
     const model = await getModel();
     if (model.card.tasks.length < 3) element("tasks").textContent = model.card.tasks.join(", ");
     element("model").textContent = `model ${model.name} on ${model.backend}`;
-    floor = Math.max(floor, model.least_confidence);
+    floor = Math.max(Math.min(floor, model.confidence), model.least_confidence);
     chunkSize = Math.min(chunkSize, model.max_images);
-    element("confidence").min = floor;
-    element("confidence").value = model.card.thresholds.confidence;
+    setSlider(element("confidence"), model.confidence);
     readControls();
   } catch (error) {
     met = null;
     throw error;
   }
+}
+
+/** Put a slider exactly on a value, which need not be round: its steps are counted from its least value. */
+function setSlider(slider, value) {
+  const steps = Math.floor((value - floor) / slider.step + 1e-6);
+  slider.min = (value - steps * slider.step).toFixed(6);
+  slider.max = Math.max(slider.max, value);
+  slider.value = value;
 }
 
 /** Run a job; another one stops it. Errors are shown, and a missing token is asked for. */
