@@ -51,6 +51,19 @@ PoseStamped = _message("PoseStamped", header=Header, pose=Pose)
 Path = _message("Path", header=Header, poses=list)
 
 
+class ParameterDescriptor:
+    def __init__(self, *, read_only: bool = False) -> None:
+        self.read_only = read_only
+
+
+class ParameterError(Exception):
+    pass
+
+
+class ExternalShutdownError(Exception):
+    pass
+
+
 class Publisher:
     def __init__(self) -> None:
         self.published: list[Any] = []
@@ -66,11 +79,20 @@ class Node:
         self.publishers: dict[str, Publisher] = {}
         self.subscriptions: dict[str, Any] = {}
         self.messages: list[str] = []
+        self.settable: set[str] = set()
 
     overrides: ClassVar[dict[str, Any]] = {}
 
-    def declare_parameter(self, name: str, default: Any) -> Any:
-        return types.SimpleNamespace(value=self.overrides.get(name, default))
+    def declare_parameter(self, name: str, default: Any, descriptor: ParameterDescriptor | None = None) -> Any:
+        value = self.overrides.get(name, default)
+        if type(value) is not type(default):  # InvalidParameterTypeException
+            raise ParameterError(
+                f"Trying to set parameter '{name}' to '{value}' of type '{type(value).__name__}', "
+                f"expecting type '{type(default).__name__}'"
+            )
+        if descriptor is None or not descriptor.read_only:
+            self.settable.add(name)
+        return types.SimpleNamespace(value=value)
 
     def create_publisher(self, kind: type, topic: str, depth: int) -> Publisher:
         self.publishers[topic] = Publisher()
@@ -98,13 +120,17 @@ def modules() -> dict[str, types.ModuleType]:
         KEEP_LAST = BEST_EFFORT = 1
 
     return {
-        "rclpy": module("rclpy", init=lambda: None, try_shutdown=lambda: None),
+        "rclpy": module("rclpy", init=lambda: None, spin=lambda node: None, try_shutdown=lambda: None),
+        "rclpy.exceptions": module("rclpy.exceptions", ParameterException=ParameterError),
+        "rclpy.executors": module("rclpy.executors", ExternalShutdownException=ExternalShutdownError),
         "rclpy.node": module("rclpy.node", Node=Node),
         "rclpy.qos": module("rclpy.qos", HistoryPolicy=Policy, ReliabilityPolicy=Policy, QoSProfile=dict),
         "geometry_msgs": module("geometry_msgs"),
         "geometry_msgs.msg": module("geometry_msgs.msg", PoseStamped=PoseStamped),
         "nav_msgs": module("nav_msgs"),
         "nav_msgs.msg": module("nav_msgs.msg", Path=Path),
+        "rcl_interfaces": module("rcl_interfaces"),
+        "rcl_interfaces.msg": module("rcl_interfaces.msg", ParameterDescriptor=ParameterDescriptor),
         "sensor_msgs": module("sensor_msgs"),
         "sensor_msgs.msg": module("sensor_msgs.msg", Image=Image),
         "vision_msgs": module("vision_msgs"),

@@ -31,6 +31,14 @@ def messages(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 @pytest.fixture
+def node_module(messages: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+    for name, module in fakes.modules().items():
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.delitem(sys.modules, "trilitenet_ros.node", raising=False)
+    return importlib.import_module("trilitenet_ros.node")
+
+
+@pytest.fixture
 def types(messages: Any) -> Any:
     return messages.Types(
         **{name: getattr(fakes, name) for name in messages.Types.__dataclass_fields__},
@@ -135,11 +143,7 @@ class _Backend:
     def close(self) -> None: ...
 
 
-def test_the_node_publishes_what_is_seen(messages: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, module in fakes.modules().items():
-        monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.delitem(sys.modules, "trilitenet_ros.node", raising=False)
-    node_module = importlib.import_module("trilitenet_ros.node")
+def test_the_node_publishes_what_is_seen(node_module: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trilitenet.load", lambda model, **options: Predictor(_Backend()), raising=False)
     node = node_module.PerceptionNode()
     message = _image("bgr8", np.zeros((96, 160, 3), np.uint8))
@@ -159,12 +163,8 @@ def test_the_node_publishes_what_is_seen(messages: Any, monkeypatch: pytest.Monk
 
 
 def test_a_camera_file_of_another_shape_is_told_and_the_rest_published(
-    messages: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    node_module: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    for name, module in fakes.modules().items():
-        monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.delitem(sys.modules, "trilitenet_ros.node", raising=False)
-    node_module = importlib.import_module("trilitenet_ros.node")
     monkeypatch.setattr("trilitenet.load", lambda model, **options: Predictor(_Backend()), raising=False)
     file = tmp_path / "camera.yaml"
     file.write_text("image_width: 100\nimage_height: 100\nheight: 1.5\nfield_of_view: 60\n", encoding="utf-8")
@@ -176,18 +176,44 @@ def test_a_camera_file_of_another_shape_is_told_and_the_rest_published(
     assert "the camera file is for 100x100 pixels" in "".join(node.messages)
 
 
-@pytest.mark.parametrize("parameters", [{"model": "nomodel"}, {"camera_file": "missing.yaml"}, {"confidence": 2.0}])
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"model": "nomodel"},
+        {"camera_file": "missing.yaml"},
+        {"confidence": 2.0},
+        {"confidence": 1},
+        {"confidence": "x"},
+    ],
+)
 def test_a_wrong_parameter_is_one_line(
-    messages: Any, monkeypatch: pytest.MonkeyPatch, parameters: dict[str, Any]
+    node_module: Any, monkeypatch: pytest.MonkeyPatch, parameters: dict[str, Any]
 ) -> None:
-    for name, module in fakes.modules().items():
-        monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.delitem(sys.modules, "trilitenet_ros.node", raising=False)
-    node_module = importlib.import_module("trilitenet_ros.node")
     monkeypatch.setattr(fakes.Node, "overrides", parameters)
     with pytest.raises(SystemExit) as ended:
         node_module.main()
     assert re.fullmatch(r"error: .*(nomodel|missing\.yaml|confidence).*", str(ended.value.code))
+
+
+@pytest.mark.parametrize("interrupted", ["load", "spin"])
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, fakes.ExternalShutdownError])
+def test_a_node_that_is_told_to_stop_ends_quietly(
+    node_module: Any, monkeypatch: pytest.MonkeyPatch, stop: type[BaseException], interrupted: str
+) -> None:
+    def end(*_: Any, **__: Any) -> None:
+        raise stop
+
+    ended: list[bool] = []
+    monkeypatch.setattr(node_module.rclpy, "try_shutdown", lambda: ended.append(True))
+    monkeypatch.setattr("trilitenet.load", lambda model, **options: Predictor(_Backend()), raising=False)
+    monkeypatch.setattr({"load": "trilitenet.load", "spin": "rclpy.spin"}[interrupted], end)
+    node_module.main()
+    assert ended == [True]
+
+
+def test_parameters_cannot_be_set_to_no_effect(node_module: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trilitenet.load", lambda model, **options: Predictor(_Backend()), raising=False)
+    assert node_module.PerceptionNode().settable == set()
 
 
 def test_the_package_is_described_once_and_alike() -> None:
@@ -195,11 +221,11 @@ def test_the_package_is_described_once_and_alike() -> None:
     assert manifest.findtext("name") == PACKAGE.name
     needed = {element.text for element in manifest.findall("exec_depend")}
     source = (PACKAGE / "trilitenet_ros" / "node.py").read_text(encoding="utf-8")
-    for package in ("rclpy", "geometry_msgs", "nav_msgs", "sensor_msgs", "vision_msgs"):
+    for package in ("rclpy", "rcl_interfaces", "geometry_msgs", "nav_msgs", "sensor_msgs", "vision_msgs"):
         assert f"from {package}" in source
         assert package in needed
     parameters = yaml.safe_load((PACKAGE / "config" / "trilitenet.yaml").read_text(encoding="utf-8"))
     for name in parameters["trilitenet"]["ros__parameters"]:
-        assert f'declare_parameter("{name}"' in source
+        assert f'_parameter("{name}"' in source
     assert f'version="{manifest.findtext("version")}"' in (PACKAGE / "setup.py").read_text(encoding="utf-8")
     assert (PACKAGE / "resource" / PACKAGE.name).exists()

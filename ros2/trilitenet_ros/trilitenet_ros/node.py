@@ -10,10 +10,14 @@ from __future__ import annotations
 import copy
 import dataclasses
 import sys
+from typing import Any
 
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
@@ -36,14 +40,14 @@ class PerceptionNode(Node):
 
     def __init__(self) -> None:
         super().__init__("trilitenet")
-        confidence = self.declare_parameter("confidence", -1.0).value
-        camera_file = self.declare_parameter("camera_file", "").value
-        self._vehicle_frame = self.declare_parameter("vehicle_frame", "base_link").value
-        self._publish_masks = self.declare_parameter("publish_masks", True).value
+        confidence = self._parameter("confidence", -1.0)
+        camera_file = self._parameter("camera_file", "")
+        self._vehicle_frame = self._parameter("vehicle_frame", "base_link")
+        self._publish_masks = self._parameter("publish_masks", True)
         self._predictor = trilitenet.load(
-            self.declare_parameter("model", "tiny").value,
-            device=self.declare_parameter("device", "auto").value,
-            backend=self.declare_parameter("backend", "auto").value,
+            self._parameter("model", "tiny"),
+            device=self._parameter("device", "auto"),
+            backend=self._parameter("backend", "auto"),
             confidence=None if confidence < 0 else confidence,
         )
         self._monitor = RoadMonitor(read_camera(camera_file) if camera_file else None)
@@ -54,6 +58,10 @@ class PerceptionNode(Node):
         self._lanes = [self.create_publisher(Path, f"~/lane_{side}", 1) for side in ("left", "right")]
         self.create_subscription(Image, "image", self._on_image, NEWEST)
         self.get_logger().info(f"ready: {self._predictor.backend.name}")
+
+    def _parameter(self, name: str, default: Any) -> Any:
+        """Return a parameter. It is read here only, so it cannot be set later."""
+        return self.declare_parameter(name, default, ParameterDescriptor(read_only=True)).value
 
     def _on_image(self, message: Image) -> None:
         try:
@@ -84,16 +92,12 @@ def main() -> None:
     """Run the node until it is stopped."""
     rclpy.init()
     try:
-        node = PerceptionNode()
-    except TriLiteNetError as error:  # a parameter
-        rclpy.try_shutdown()
+        rclpy.spin(PerceptionNode())
+    except (TriLiteNetError, ParameterException) as error:  # a parameter's value, or its type
         sys.exit(f"error: {error}")
-    try:
-        rclpy.spin(node)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ExternalShutdownException):  # Ctrl-C, also while the model loads; SIGTERM
         pass
     finally:
-        node.destroy_node()
         rclpy.try_shutdown()
 
 
