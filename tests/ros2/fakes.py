@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import types
+from os import PathLike
 from typing import Any, ClassVar
 
 
@@ -108,13 +109,33 @@ class Node:
         return types.SimpleNamespace(info=log, error=log)
 
 
+def module(name: str, **names: Any) -> types.ModuleType:
+    made = types.ModuleType(name)
+    made.__dict__.update(names)
+    return made
+
+
+def launch_modules(share: PathLike[str]) -> dict[str, types.ModuleType]:
+    """Return what a launch file imports; actions become their arguments."""
+
+    def action(*arguments: Any, **options: Any) -> Any:
+        return arguments, options
+
+    return {
+        "ament_index_python": module("ament_index_python"),
+        "ament_index_python.packages": module(
+            "ament_index_python.packages", get_package_share_directory=lambda name: str(share)
+        ),
+        "launch": module("launch", LaunchDescription=list),
+        "launch.actions": module("launch.actions", DeclareLaunchArgument=action),
+        "launch.substitutions": module("launch.substitutions", LaunchConfiguration=lambda name: f"${name}"),
+        "launch_ros": module("launch_ros"),
+        "launch_ros.actions": module("launch_ros.actions", Node=action),
+    }
+
+
 def modules() -> dict[str, types.ModuleType]:
     """Return what ``import rclpy`` and the message packages would find."""
-
-    def module(name: str, **names: Any) -> types.ModuleType:
-        made = types.ModuleType(name)
-        made.__dict__.update(names)
-        return made
 
     class Policy:
         KEEP_LAST = BEST_EFFORT = 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import importlib
+import importlib.util
 import math
 import re
 import sys
@@ -214,6 +215,21 @@ def test_a_node_that_is_told_to_stop_ends_quietly(
 def test_parameters_cannot_be_set_to_no_effect(node_module: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trilitenet.load", lambda model, **options: Predictor(_Backend()), raising=False)
     assert node_module.PerceptionNode().settable == set()
+
+
+def test_the_launch_file_takes_a_file_of_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, module in fakes.launch_modules(PACKAGE).items():
+        monkeypatch.setitem(sys.modules, name, module)
+    spec = importlib.util.spec_from_file_location("launch_file", PACKAGE / "launch" / "trilitenet.launch.py")
+    assert spec is not None
+    assert spec.loader is not None
+    launch_file = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(launch_file)
+    *arguments, node = launch_file.generate_launch_description()
+    defaults = {name: options["default_value"] for (name,), options in arguments}
+    assert defaults == {"image": "/camera/image_raw", "parameters": str(PACKAGE / "config" / "trilitenet.yaml")}
+    assert node[1]["parameters"] == ["$parameters"]
+    assert node[1]["remappings"] == [("image", "$image")]
 
 
 def test_the_package_is_described_once_and_alike() -> None:

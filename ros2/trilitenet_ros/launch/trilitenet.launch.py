@@ -1,4 +1,4 @@
-"""Start the node with the parameters of config/trilitenet.yaml; ``image`` names the camera's topic."""
+"""Start the node: ``image`` names the camera's topic, ``parameters`` a file in place of config/trilitenet.yaml."""
 
 from pathlib import Path
 
@@ -15,11 +15,12 @@ def generate_launch_description():
     return LaunchDescription(
         [
             DeclareLaunchArgument("image", default_value="/camera/image_raw"),
+            DeclareLaunchArgument("parameters", default_value=str(parameters)),
             Node(
                 package="trilitenet_ros",
                 executable="perception",
                 name="trilitenet",
-                parameters=[str(parameters)],
+                parameters=[LaunchConfiguration("parameters")],
                 remappings=[("image", LaunchConfiguration("image"))],
                 output="screen",
             ),
