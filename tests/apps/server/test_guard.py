@@ -198,12 +198,14 @@ def test_the_log_names_requests_and_nothing_of_their_content(
     client: TestClient, jpeg: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.INFO, logger="trilitenet.server"):
-        client.post("/v1/predict?token=secret", files={"image": ("secret.jpg", jpeg)}, headers={"x-request-id": "one"})
+        client.post("/v1/predict", files={"image": ("secret.jpg", jpeg)}, headers={"x-request-id": "one"})
         client.post("/v1/predict", content=b"secret")
-    first, second = [record for record in caplog.records if record.message == "request"]
+        client.post("/v1/predict?token=secret", content=jpeg)
+    first, second, third = [record for record in caplog.records if record.message == "request"]
     fields = {"request_id": "one", "method": "POST", "route": "/v1/predict", "status": 200}
     assert fields.items() <= first.__dict__.items()
     assert second.__dict__["problem"] == "unsupported_type"
+    assert third.__dict__["problem"] == "bad_parameter"
     assert "secret" not in repr([record.__dict__ for record in caplog.records])
 
 

@@ -192,6 +192,30 @@ def test_bad_parameters_are_named(client: TestClient, jpeg: bytes, query: str) -
     assert answer.json()["error"]["message"].startswith(query[1:].split("=")[0])
 
 
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("?confidenc=0.5", "unknown parameter 'confidenc'; did you mean 'confidence'?"),
+        ("/batch?format=overlay", "unknown parameter 'format'; known: confidence"),
+    ],
+)
+def test_parameters_that_are_not_known_are_refused(client: TestClient, jpeg: bytes, path: str, message: str) -> None:
+    answer = client.post(f"/v1/predict{path}", content=jpeg)
+    assert answer.status_code == 422
+    assert (answer.json()["error"]["code"], answer.json()["error"]["message"]) == ("bad_parameter", message)
+
+
+def test_a_form_of_one_image_says_what_is_too_much(client: TestClient, jpeg: bytes) -> None:
+    image = ("image", ("a.jpg", jpeg))
+    for files in ([image, ("confidence", (None, b"0.5"))], [("confidence", (None, b"0.5")), image]):
+        answer = client.post("/v1/predict", files=files)
+        assert answer.status_code == 400
+        assert "'confidence'" in answer.json()["error"]["message"]
+    answer = client.post("/v1/predict", files=[image, image])
+    assert answer.status_code == 413
+    assert "/v1/predict/batch" in answer.json()["error"]["message"]
+
+
 def test_models_shows_the_card(client: TestClient) -> None:
     (model,) = client.get("/v1/models").json()["models"]
     assert model["name"] == "tiny"

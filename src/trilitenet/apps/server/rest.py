@@ -11,7 +11,7 @@ from collections.abc import Callable, Coroutine
 from typing import Annotated, Any, Final, Literal, TypeVar
 
 import numpy as np
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Depends, Query, Request
 from numpy.typing import NDArray
 from PIL import Image
 from starlette.requests import ClientDisconnect
@@ -23,6 +23,7 @@ from trilitenet.apps.server.intake import Reservation, check_header, read_body, 
 from trilitenet.apps.server.multipart import split_form
 from trilitenet.apps.server.problems import BusyError, ProblemError
 from trilitenet.apps.server.service import Encoded, Outcome, Service
+from trilitenet.errors import did_you_mean
 from trilitenet.processing.drawing import DRIVABLE_COLOUR, LANE_COLOUR
 from trilitenet.structures import Perception
 
@@ -45,7 +46,7 @@ def rest_router(service: Service) -> APIRouter:
     """Return the routes of ``/v1``, ``/healthz``, ``/readyz`` and ``/metrics``."""
     router = APIRouter()
 
-    @router.post("/v1/predict", tags=["prediction"], **openapi.PREDICT)
+    @router.post("/v1/predict", tags=["prediction"], dependencies=[_only("format", "confidence")], **openapi.PREDICT)
     async def predict(
         request: Request,
         output: Annotated[Format, Query(alias="format", description="What to answer with.")] = "json",
@@ -58,7 +59,7 @@ def rest_router(service: Service) -> APIRouter:
             work = service.see(image, deadline, finish, confidence, keep_image=output == "overlay")
             return await until_vanished(request, work)
 
-    @router.post("/v1/predict/batch", tags=["prediction"], **openapi.PREDICT_BATCH)
+    @router.post("/v1/predict/batch", tags=["prediction"], dependencies=[_only("confidence")], **openapi.PREDICT_BATCH)
     async def predict_batch(request: Request, confidence: Confidence = None) -> Response:
         """See several images. One that is broken does not spoil the others: each has a status of its own."""
         images = await _all_images(request, service, request.scope["state"]["reservation"])
@@ -109,6 +110,18 @@ def rest_router(service: Service) -> APIRouter:
         return Response(service.metrics.text(), media_type="text/plain; version=0.0.4")
 
     return router
+
+
+def _only(*known: str) -> Any:
+    """Return a dependency that refuses other parameters: a misspelt one would be passed over without a word."""
+
+    async def check(request: Request) -> None:
+        for name in request.query_params:
+            if name not in known:
+                name = name[:40]
+                raise ProblemError(422, "bad_parameter", f"unknown parameter {name!r}{did_you_mean(name, known)}")
+
+    return Depends(check)
 
 
 async def read_request(request: Request, service: Service, reservation: Reservation) -> bytes:
@@ -179,12 +192,18 @@ async def _encoded(request: Request, service: Service, reservation: Reservation,
     if not content_type.lower().startswith("multipart/"):
         return [body]
     reservation.take(len(body))  # the parts are copies
-    parts = await service.in_pool(split_form, body, content_type, most)
+    parts = await service.in_pool(split_form, body, content_type, service.settings.max_images)
     for part in parts:
         if part.name not in {"image", "images"}:
-            raise ProblemError(400, "unknown_field", f"unknown form field {part.name[:40]!r}: call it image")
+            raise ProblemError(
+                400,
+                "unknown_field",
+                f"unknown form field {part.name[:40]!r}: that of the image is image; parameters go into the address",
+            )
     if not parts:
         raise ProblemError(400, "empty", "the form holds no image")
+    if len(parts) > most:
+        raise ProblemError(413, "too_many_parts", "the form has more than one image: send it to /v1/predict/batch")
     return [part.data for part in parts]
 
 
