@@ -280,6 +280,28 @@ def test_a_kill_between_the_best_and_the_checkpoint_is_no_step_back(
     assert (result.steps, result.best["drivable"]) == (6, 0.3)
 
 
+def test_best_weights_newer_than_the_checkpoint_stop_no_resumed_run_early(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = iter([0.1, 0.2, 0.3, 0.4, 0.3, 0.4])  # the third and fourth epoch are run again
+    monkeypatch.setattr("trilitenet.commands.train.validation_figures", lambda *_: {"drivable/miou": next(values)})
+    save = Trainer.save
+
+    def killed(self: Trainer) -> None:
+        if self.step == 8:
+            raise KeyboardInterrupt
+        save(self)
+
+    options = {"val_split": "val", "tasks": ("drivable",), "pictures": 0, "patience": 1, "checkpoint_every": 2}
+    run = settings(scenes, tmp_path, **options, max_steps=8)
+    monkeypatch.setattr(Trainer, "save", killed)
+    with pytest.raises(KeyboardInterrupt):
+        train(**run)
+    monkeypatch.setattr(Trainer, "save", save)
+    result = train(resume=True, **run)
+    assert (result.steps, result.best["drivable"]) == (8, 0.4)
+
+
 def test_an_average_that_comes_later_begins_at_the_weights(scenes: Path, tmp_path: Path) -> None:
     options = settings(scenes, tmp_path, max_steps=2)
     weights = load_network(train(**options, ema_decay=0.0).weights).state_dict()

@@ -211,7 +211,8 @@ class Trainer:
         self.stale = 0
         self.ended = 0
         """Step at which an epoch was last validated and saved, for a stop comes between it and its last step."""
-        self._ahead: dict[str, tuple[float, int]] = {}
+        self._ahead: dict[str, float] = {}
+        """What the files of best weights reached that are newer than the checkpoint."""
         self.seconds = 0.0
         self.images = 0
 
@@ -377,13 +378,14 @@ class Trainer:
             scores["overall"] = sum(scores.values()) / len(scores)
         self.stale += 1
         for name, value in scores.items():
-            # A file that is newer than the checkpoint is made again by the steps that are run again.
-            if value > self.best.get(name, -math.inf) or self._ahead.get(name) == (value, self.step):
+            if value > self.best.get(name, -math.inf):
                 self.best[name] = value
-                card = self._card()
-                card = dataclasses.replace(card, metrics={**card.metrics, f"best {name}": value})
-                save_network(self.averaged, self._best_path(name), card)
                 self.stale = 0 if name == "overall" else self.stale
+                # A better file that is newer than the checkpoint is made again by a step that is yet to be run again.
+                if value >= self._ahead.get(name, -math.inf):
+                    card = self._card()
+                    card = dataclasses.replace(card, metrics={**card.metrics, f"best {name}": value})
+                    save_network(self.averaged, self._best_path(name), card)
 
     def _best_path(self, name: str) -> Path:
         return self.folder / f"best-{name}.safetensors"
@@ -505,16 +507,14 @@ class Trainer:
         set_random_state(state["random"])
 
     def _read_best(self) -> None:
-        """Learn from files newer than the checkpoint what is to be beaten."""
+        """Learn from files newer than the checkpoint what must not be replaced by worse."""
         for name in (*self.network.tasks, "overall"):
             path = self._best_path(name)
             if not path.is_file():
                 continue
-            card = read_card(path)
-            value = card.metrics.get(f"best {name}", -math.inf)
+            value = read_card(path).metrics.get(f"best {name}", -math.inf)
             if value > self.best.get(name, -math.inf):
-                self.best[name] = value
-                self._ahead[name] = value, int(card.provenance.get("steps", 0))
+                self._ahead[name] = value
 
     def _scaler_state(self) -> dict[str, Any]:
         state: dict[str, Any] = self.fabric._precision.state_dict()
