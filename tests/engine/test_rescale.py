@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import dataclasses
+
+import pytest
 import torch
 
 from trilitenet.data.batches import Batch
@@ -30,6 +33,17 @@ def test_images_masks_and_boxes_go_together() -> None:
     assert small.ignored.tolist() == [[0, 50.0, 5.0, 10.0, 10.0]]
     assert bool((small.drivable[0, 16:, :32] == 1).all())
     assert set(small.lane.unique().tolist()) == {0, 1, 255}
+
+
+def test_masks_stay_where_their_pixels_are() -> None:
+    whole = batch()
+    edge = (torch.arange(128) < 51).to(torch.uint8).expand(1, 64, 128)
+    pictured = dataclasses.replace(whole, images=(edge * 200)[:, None].expand(1, 3, 64, 128), lane=edge)
+    for size in ((32, 96), (32, 64), (96, 160), (96, 224)):
+        moved = rescale(pictured, size)
+        # The edge in pixels, of which the image has parts.
+        assert float(moved.images[0, 0, 9].sum() / 200) == pytest.approx(51 * size[1] / 128, abs=0.05)
+        assert int(moved.lane[0, 9].sum()) == pytest.approx(51 * size[1] / 128, abs=0.5)
 
 
 def test_the_same_size_changes_nothing() -> None:

@@ -37,7 +37,8 @@ def rescale(batch: Batch, size: tuple[int, int]) -> Batch:
     if (height, width) == size:
         return batch
     images = F.interpolate(batch.images.float(), size, mode="bilinear", align_corners=False, antialias=True)
-    masks = [F.interpolate(mask[:, None], size, mode="nearest")[:, 0] for mask in (batch.drivable, batch.lane)]
+    # Pixel by pixel at its centre, as the image is; "nearest" would move masks by up to a pixel.
+    masks = [F.interpolate(mask[:, None], size, mode="nearest-exact")[:, 0] for mask in (batch.drivable, batch.lane)]
     scale = torch.tensor([size[1] / width, size[0] / height] * 2, device=batch.boxes.device)
     return dataclasses.replace(
         batch,
