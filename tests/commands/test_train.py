@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import multiprocessing
 import os
 import re
@@ -19,7 +20,7 @@ import torch
 import yaml
 
 import trilitenet
-from trilitenet.commands.train import train
+from trilitenet.commands.train import _Display, train, validation_figures
 from trilitenet.commands.train_table import train_table
 from trilitenet.config import DEFAULT_ANCHORS, TASKS
 from trilitenet.data.description import read_description, write_description
@@ -257,6 +258,43 @@ def test_a_stop_in_the_last_step_of_an_epoch_loses_no_validation(
     assert read_card(parts.weights).metrics == read_card(straight.weights).metrics
     same(state(tmp_path / "straight"), state(tmp_path / "parts"))
     assert curves(tmp_path / "straight") == curves(tmp_path / "parts")
+
+
+def test_a_stop_while_the_network_is_measured_waits_for_no_more_images(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = {"val_split": "val", "max_steps": 4, "pictures": 0}
+    straight = train(**logged(scenes, tmp_path / "straight", **options))
+
+    def stopped(network: TriLiteNet, dataset: DrivingDataset, device: str, progress: Any) -> dict[str, float]:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return validation_figures(network, dataset, device, progress)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("trilitenet.commands.train.validation_figures", stopped)
+        result = train(**logged(scenes, tmp_path / "parts", **options))
+    assert (result.finished, result.steps, result.metrics) == (False, 2, {})
+    parts = train(resume=True, **logged(scenes, tmp_path / "parts", **options))
+    assert parts.metrics == straight.metrics
+    same(state(tmp_path / "straight"), state(tmp_path / "parts"))
+    assert curves(tmp_path / "straight") == curves(tmp_path / "parts")
+
+
+def test_a_terminal_shows_how_far_validation_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setenv("TERM", "xterm")
+    shown = []
+    for images in (30, 2):
+        monkeypatch.setattr("sys.stderr", Terminal())
+        with _Display(quiet=False) as display:
+            display.step(5, 6, "epoch 1/1 step 5/6: total 1.0")
+            display.validation(images, 30)
+        assert isinstance(sys.stderr, Terminal)
+        shown.append(re.search(r"validation.*\b2/30", sys.stderr.getvalue()) is not None)
+    assert shown == [False, True]  # gone at the end
 
 
 def test_a_kill_between_the_best_and_the_checkpoint_is_no_step_back(

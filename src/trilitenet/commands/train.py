@@ -9,7 +9,7 @@ import logging
 import math
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, get_type_hints
 
@@ -18,7 +18,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from trilitenet.commands.evaluate import warn_of_foreign
 from trilitenet.commands.paths import text_paths
@@ -121,6 +129,11 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
         if config.val_split:
             validation = DrivingDataset(config.data, config.val_split, class_names=network.card.class_names)
         device = str(fabric.device)
+
+        def validate(network: TriLiteNet, progress: Callable[[int, int], None]) -> dict[str, float]:
+            assert validation is not None
+            return validation_figures(network, validation, device, progress)
+
         trainer = Trainer(
             config,
             network,
@@ -129,7 +142,7 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
             fabric,
             network.card,
             identity=identify(dataset),
-            validate=None if validation is None else lambda network: validation_figures(network, validation, device),
+            validate=None if validation is None else validate,
             teacher=_teacher(config, network),
             display=display,
         )
@@ -313,10 +326,15 @@ def _teacher(config: TrainConfig, network: TriLiteNet) -> tuple[TriLiteNet, Dist
     return teacher, DistillationLoss(network.anchors, teacher.anchors, config.distillation)
 
 
-def validation_figures(network: TriLiteNet, dataset: DrivingDataset, device: str) -> dict[str, float]:
-    """Score a network by the evaluation command's own code (the 'fair' protocol); return its figures by name."""
+def validation_figures(
+    network: TriLiteNet, dataset: DrivingDataset, device: str, progress: Callable[[int, int], None] | None = None
+) -> dict[str, float]:
+    """Score a network by the evaluation command's own code (the 'fair' protocol); return its figures by name.
+
+    ``progress`` is called with how many images are scored, and of how many.
+    """
     predictor = Predictor(TorchBackend(network, device))
-    scores = evaluate(predictor, dataset, batch_size=8, resamples=0, worst=0).fair
+    scores = evaluate(predictor, dataset, batch_size=8, resamples=0, worst=0, progress=progress).fair
     figures: dict[str, float] = {}
     if scores is None:
         return figures
@@ -349,9 +367,10 @@ class _Display:
     def __init__(self, *, quiet: bool) -> None:
         self._quiet = quiet
         self._bar: Progress | None = None
+        self._validation: TaskID | None = None
         if not quiet and sys.stderr.isatty():
             self._bar = Progress(
-                TextColumn("step"),
+                TextColumn("{task.fields[what]}"),
                 MofNCompleteColumn(),
                 BarColumn(),
                 TimeElapsedColumn(),
@@ -359,7 +378,7 @@ class _Display:
                 TextColumn("{task.description}"),
                 console=Console(stderr=True),
             )
-            self._task = self._bar.add_task("", total=None)
+            self._task = self._bar.add_task("", total=None, what="step")
 
     def __enter__(self) -> _Display:
         if self._bar is not None:
@@ -384,6 +403,17 @@ class _Display:
             self._bar.update(self._task, completed=step, total=steps, description=text.partition(": ")[2])
         else:
             self.line(text)
+
+    def validation(self, images: int, count: int) -> None:
+        """Show how many images the network has been measured on, and of how many."""
+        if self._bar is None:
+            return
+        if self._validation is None:
+            self._validation = self._bar.add_task("", what="validation")
+        self._bar.update(self._validation, completed=images, total=count)
+        if images == count:
+            self._bar.remove_task(self._validation)
+            self._validation = None
 
 
 def _flags(config: type[Any], prefix: str = "") -> list[inspect.Parameter]:

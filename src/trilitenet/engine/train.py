@@ -80,6 +80,9 @@ class Display(Protocol):
     def step(self, step: int, steps: int, text: str) -> None:
         """Show how far the run is."""
 
+    def validation(self, images: int, count: int) -> None:
+        """Show how many images the network has been measured on, and of how many."""
+
 
 @dataclasses.dataclass(frozen=True)
 class TrainResult:
@@ -122,6 +125,10 @@ class TrainResult:
         return f"finished {speed}: {self.weights}" + (f" ({figures})" if figures else "")
 
 
+class _LeftValidationError(Exception):
+    """A wish to stop came while the network was measured."""
+
+
 class _FromPixels(nn.Module):
     """A network that takes (B, 3, H, W) uint8 RGB: Fabric would round normalised pixels to bf16 on their way in."""
 
@@ -145,7 +152,8 @@ class Trainer:
         fabric: A launched ``lightning_fabric.Fabric``.
         card: What the weights' file is to say of them.
         identity: Of the training data, see `trilitenet.data.identity`; a checkpoint of other data is refused.
-        validate: Returns figures of a network by name; see `FIGURES` for those that tell what is best.
+        validate: Returns figures of a network by name; see `FIGURES` for those that tell what is best. It is to call
+            its second argument with how many images are measured, and of how many.
         teacher: A network to distil from, and the loss for it.
         display: Shows the run.
     """
@@ -160,7 +168,7 @@ class Trainer:
         card: ModelCard,
         *,
         identity: Mapping[str, Any] | None = None,
-        validate: Callable[[TriLiteNet], Mapping[str, float]] | None = None,
+        validate: Callable[[TriLiteNet, Callable[[int, int], None]], Mapping[str, float]] | None = None,
         teacher: tuple[TriLiteNet, DistillationLoss] | None = None,
         display: Display | None = None,
     ) -> None:
@@ -269,13 +277,13 @@ class Trainer:
         """Run the epochs; return whether the end was reached, by schedule or by early stopping."""
         with StopRequest() as stop:
             if self.ended < self.step and (self.step % self.epoch_steps == 0 or self.step >= self.steps):
-                self._end_epoch((self.step - 1) // self.epoch_steps)
+                self._end_epoch((self.step - 1) // self.epoch_steps, stop)
             while self.step < self.steps and not self._stopped(stop) and not self._stalled():
                 epoch, start = divmod(self.step, self.epoch_steps)
                 self._train_epoch(epoch, start, stop)
                 if self._stopped(stop):
                     break
-                self._end_epoch(epoch)
+                self._end_epoch(epoch, stop)
             self.save()
             return not self._stopped(stop)
 
@@ -355,20 +363,37 @@ class Trainer:
             terms = terms._replace(total=terms.total + torch.stack(tuple(distil(outputs, lesson))).sum())
         return terms
 
-    def _end_epoch(self, epoch: int) -> None:
-        """Validate, keep the best, save."""
+    def _end_epoch(self, epoch: int, stop: StopRequest) -> None:
+        """Validate, keep the best, save; not if a wish to stop comes meanwhile, for a run that goes on does it anew."""
         last = self.step >= self.steps
         if self.validate is not None and (last or (epoch + 1) % self.config.validate_every == 0):
-            if self.fabric.is_global_zero:
-                self.metrics = dict(self.validate(self.averaged))
-                self._tell({f"val/{name}": value for name, value in self.metrics.items()})
-                figures = ", ".join(f"{name} {value:.4f}" for name, value in self.metrics.items())
-                self._show(f"epoch {epoch + 1}/{self.config.epochs}: {figures}")
-                self._keep_best()
-            self.stale = self.fabric.broadcast(self.stale)
+            whole = self.fabric.is_global_zero and self._validate(epoch, stop)
+            whole, self.stale = self.fabric.broadcast((whole, self.stale))
+            if not whole:
+                return
         self.ended = self.step
         if last or (epoch + 1) % self.config.checkpoint_every == 0:
             self.save()
+
+    def _validate(self, epoch: int, stop: StopRequest) -> bool:
+        """Measure the network and keep the best; return False if a wish to stop came first."""
+
+        def show(images: int, count: int) -> None:
+            if stop:
+                raise _LeftValidationError
+            if self.display is not None:
+                self.display.validation(images, count)
+
+        assert self.validate is not None
+        try:
+            self.metrics = dict(self.validate(self.averaged, show))
+        except _LeftValidationError:
+            return False
+        self._tell({f"val/{name}": value for name, value in self.metrics.items()})
+        figures = ", ".join(f"{name} {value:.4f}" for name, value in self.metrics.items())
+        self._show(f"epoch {epoch + 1}/{self.config.epochs}: {figures}")
+        self._keep_best()
+        return True
 
     def _keep_best(self) -> None:
         """Save the weights of every task that is better than ever, and of the mean over tasks."""
