@@ -184,6 +184,8 @@ def test_a_teacher_of_other_classes_is_refused_before_anything_is_made(scenes: P
     with pytest.raises(ConfigError, match="the teacher tells the classes vehicle, the data set has car, lorry"):
         train(**settings(data, tmp_path / "run", teacher="tiny"))
     assert not (tmp_path / "run").exists()
+    masks_alone = {"teacher": "tiny", "distillation": (0.0, 1.0, 1.0), "max_steps": 1}
+    assert train(**settings(data, tmp_path / "run", **masks_alone)).finished
 
 
 def test_pixels_reach_the_network_unrounded_in_bf16(

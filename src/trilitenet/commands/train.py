@@ -319,9 +319,10 @@ def _teacher(config: TrainConfig, network: TriLiteNet) -> tuple[TriLiteNet, Dist
     if not set(teacher.tasks) & set(network.tasks):
         raise ConfigError(f"{config.teacher}: the teacher has none of the tasks {', '.join(network.tasks)}")
     told, wanted = teacher.card.class_names, network.card.class_names
-    if "detection" in teacher.tasks and "detection" in network.tasks and told != wanted:
+    if "detection" in teacher.tasks and "detection" in network.tasks and told != wanted and config.distillation[0]:
         raise ConfigError(
-            f"{config.teacher}: the teacher tells the classes {', '.join(told)}, the data set has {', '.join(wanted)}"
+            f"{config.teacher}: the teacher tells the classes {', '.join(told)}, the data set has {', '.join(wanted)}; "
+            "--distillation 0 1 1 distils the masks alone"
         )
     return teacher, DistillationLoss(network.anchors, teacher.anchors, config.distillation)
 
