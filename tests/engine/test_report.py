@@ -129,6 +129,20 @@ def test_reports_of_other_images_or_labels_are_not_paired(report: Report) -> Non
     assert not comparison.differences
     assert "other images" in comparison.unpaired["b"]
     assert "other images under the same names" in comparison.unpaired["c"]
+    hashes = dict.fromkeys(("images", "drivable", "lane", "boxes"), "ab")
+    first, other_boxes = (
+        dataclasses.replace(report, provenance=dataclasses.replace(report.provenance, data_sha256=found))
+        for found in (hashes, {**hashes, "boxes": "cd"})
+    )
+    comparison = compare_reports({"a": first, "b": other_boxes}, resamples=10)
+    assert "other labels of boxes; no paired differences of detection figures" in comparison.unpaired["b"]
+    assert {one.figure.split("/")[1] for one in comparison.differences} == {"drivable", "lane"}
+    lanes_alone = dataclasses.replace(
+        other_boxes, figures={key: one for key, one in report.figures.items() if "/lane/" in key}
+    )
+    comparison = compare_reports({"a": first, "b": lanes_alone}, resamples=10)
+    assert not comparison.unpaired
+    assert list(comparison.confidence) == ["a"]
     settings = {**report.provenance.settings, "paper_batch": 3}
     batches = dataclasses.replace(report, provenance=dataclasses.replace(report.provenance, settings=settings))
     fair = report.state["fair"]

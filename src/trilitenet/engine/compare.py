@@ -15,6 +15,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
+from trilitenet.config import Task
 from trilitenet.engine.figures import HEADLINES, meaning
 from trilitenet.engine.page import escape, interval_plot, page, percent, section, table
 from trilitenet.engine.published_rows import PUBLISHED_ROWS, PublishedRow
@@ -26,6 +27,8 @@ __all__ = ["COMPARISON_SCHEMA", "Comparison", "Difference", "compare_reports"]
 
 COMPARISON_SCHEMA: Final = 1
 """Version of the JSON of a comparison."""
+_LABELS: Final[dict[Task, str]] = {"detection": "boxes", "drivable": "drivable", "lane": "lane"}
+"""What the hash of a task's labels is called."""
 FloatArray = NDArray[np.float64]
 
 
@@ -156,14 +159,17 @@ def compare_reports(
     unpaired: dict[str, str] = {}
     for name in names[1:]:
         other = reports[name]
-        reason, published_alone = _why_unpaired(first, other), _why_published_unpaired(first, other)
-        if reason or published_alone:
-            unpaired[name] = reason or published_alone
-        if reason:
+        reasons = _why_unpaired(first, other)
+        if reasons:
+            unpaired[name] = "; ".join(
+                f"{reason}; no paired differences" + (f" of {part.strip('/')} figures" if part else "")
+                for part, reason in reasons.items()
+            )
+        if "" in reasons:
             continue
         spread = _spread(other, resamples, seed)
         for key, figure in other.figures.items():
-            if published_alone and key.startswith("paper/"):
+            if any(part in key for part in reasons):
                 continue
             if key in first.figures and key in spread and key in base:
                 low, high = interval(spread[key] - base[key])
@@ -180,7 +186,7 @@ def compare_reports(
         confidence={
             name: report.provenance.thresholds["confidence"]
             for name, report in reports.items()
-            if "confidence" in report.provenance.thresholds
+            if "confidence" in report.provenance.thresholds and _measures(report, "detection")
         },
         published=PUBLISHED_ROWS if published else (),
         resamples=resamples,
@@ -196,30 +202,35 @@ def _spread(report: Report, resamples: int, seed: int) -> dict[str, FloatArray]:
     }
 
 
-def _why_unpaired(first: Report, other: Report) -> str:
-    """Say why two reports cannot be compared image by image; empty if they can."""
+def _why_unpaired(first: Report, other: Report) -> dict[str, str]:
+    """Say why figures of two reports cannot be compared image by image: part of their keys -> the reason."""
     if first.names != other.names:
-        return f"measured on other images ({len(other.names)}, the first on {len(first.names)}); no paired differences"
-    for part, value in first.provenance.data_sha256.items():
-        if other.provenance.data_sha256.get(part, value) != value:
-            return f"measured with other {part} under the same names; no paired differences"
+        return {"": f"measured on other images ({len(other.names)}, the first on {len(first.names)})"}
+    hashes = [report.provenance.data_sha256 for report in (first, other)]
+
+    def differ(part: str) -> bool:
+        return part in hashes[0] and part in hashes[1] and hashes[0][part] != hashes[1][part]
+
+    if differ("images"):
+        return {"": "measured with other images under the same names"}
+    found = {}
+    for task, part in _LABELS.items():
+        if _measures(first, task) and _measures(other, task) and differ(part):
+            found[f"/{task}/"] = f"measured with other labels of {part}"
     classes = [report.state.get("fair", {}).get("detection", {}).get("class_names") for report in (first, other)]
     if None not in classes and classes[0] != classes[1]:
-        return f"tells {', '.join(classes[1])}, the first {', '.join(classes[0])}; no paired differences"
-    return ""
-
-
-def _why_published_unpaired(first: Report, other: Report) -> str:
-    """Say why the figures of the published protocol alone cannot be compared; empty if they can."""
+        found["/detection/"] = f"tells {', '.join(classes[1])}, the first {', '.join(classes[0])}"
     batches = [report.provenance.settings.get("paper_batch") for report in (first, other)]
-    if None not in batches and batches[0] != batches[1]:
-        return (
-            f"averages over batches of {batches[1]}, the first of {batches[0]}; no paired differences of paper figures"
-        )
     saved = [report.provenance.runtime == SAVED for report in (first, other)]
-    if saved[0] != saved[1] and "paper" in first.state and "paper" in other.state:
-        return "one was scored from saved predictions, the other not; no paired differences of paper figures"
-    return ""
+    if None not in batches and batches[0] != batches[1]:
+        found["paper/"] = f"averages over batches of {batches[1]}, the first of {batches[0]}"
+    elif saved[0] != saved[1] and "paper" in first.state and "paper" in other.state:
+        found["paper/"] = "one was scored from saved predictions, the other not"
+    return found
+
+
+def _measures(report: Report, task: Task) -> bool:
+    return any(f"/{task}/" in key for key in report.figures)
 
 
 def _keys(comparison: Comparison) -> list[str]:
