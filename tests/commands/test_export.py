@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import errno
 import os
+import pickle
 import shutil
 from pathlib import Path
 from typing import Any
@@ -103,11 +104,22 @@ def test_what_is_no_folder_of_pictures_is_told(tmp_path: Path) -> None:
             find_pictures(tmp_path / name, 8, "train")
 
 
-def test_a_dynamic_program_says_how_small_a_side_may_be(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Predictor:
+    folder = tmp_path_factory.mktemp("program")
     network = build_network("tiny", tasks=("lane",))
-    save_network(network, tmp_path / "lane.safetensors", network.card)
-    path = export(str(tmp_path / "lane.safetensors"), format="torch", size="dynamic", output=tmp_path / "a.pt2").path
-    program = trilitenet.load(path)
+    save_network(network, folder / "lane.safetensors", network.card)
+    made = export(str(folder / "lane.safetensors"), format="torch", size="dynamic", output=folder / "a.pt2")
+    return trilitenet.load(made.path)
+
+
+def test_a_program_goes_to_other_processes(program: Predictor) -> None:
+    copy = pickle.loads(pickle.dumps(program))  # noqa: S301 - its own
+    image = np.full((64, 96, 3), 90, np.uint8)
+    np.testing.assert_array_equal(copy(image).lane, program(image).lane)
+
+
+def test_a_dynamic_program_says_how_small_a_side_may_be(program: Predictor) -> None:
     program.backend.run(np.zeros((1, 64, 96, 3), np.uint8))
     for size in ((32, 96), (96, 32)):
         with pytest.raises(ShapeError, match="takes sides from 64 pixels"):

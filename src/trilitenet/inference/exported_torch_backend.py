@@ -51,7 +51,12 @@ class ExportedTorchBackend:
         found = {key: value.decode() if isinstance(value, bytes) else value for key, value in metadata.items() if value}
         self._card, self.info = read_metadata(found, str(path))
         self.device = pick_device("cpu" if device == "auto" else device)
+        self._path = path
         self._module = program.module().to(self.device)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle it as what opens it again: its file, which must be there, and its device."""
+        return ExportedTorchBackend, (self._path.absolute(), str(self.device))
 
     @property
     def card(self) -> ModelCard:
