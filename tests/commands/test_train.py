@@ -36,8 +36,8 @@ from trilitenet.engine.train import Trainer
 from trilitenet.errors import ConfigError, DataError, MissingExtraError, OutputError, TrainingError, WeightsError
 from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.models.encoder import Encoder
-from trilitenet.models.trilitenet import TriLiteNet
-from trilitenet.models.weights import load_network, read_card
+from trilitenet.models.trilitenet import TriLiteNet, build_network
+from trilitenet.models.weights import load_network, read_card, save_network
 from trilitenet.structures import Boxes, Perception
 
 pytest.importorskip("lightning_fabric")
@@ -175,6 +175,27 @@ def test_going_on_with_other_frozen_parts_is_refused(scenes: Path, tmp_path: Pat
 def test_the_losses_of_every_step_are_logged(scenes: Path, tmp_path: Path) -> None:
     train(**logged(scenes, tmp_path, max_steps=5, log_every=3))  # two steps an epoch
     assert [step for step, name, _ in read_csv(tmp_path / "metrics.csv") if name == "lr"] == [2, 3, 4, 5]
+
+
+def test_a_teacher_gets_pixels_normalised_as_its_card_says(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network = build_network("tiny")
+    card = dataclasses.replace(network.card, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0))
+    save_network(network, tmp_path / "teacher.safetensors", card)
+    pixels: list[torch.Tensor] = []
+
+    def look(_network: TriLiteNet, inputs: tuple[torch.Tensor]) -> None:
+        pixels.extend(inputs)
+
+    def watched(path: str) -> TriLiteNet:
+        teacher = load_network(path)
+        teacher.register_forward_pre_hook(look)
+        return teacher
+
+    monkeypatch.setattr("trilitenet.commands.train.load_network", watched)
+    train(**settings(scenes, tmp_path / "run", max_steps=1, teacher=str(tmp_path / "teacher.safetensors")))
+    assert 0 <= float(pixels[0].min()) < float(pixels[0].max()) <= 1
 
 
 def test_a_teacher_of_other_classes_is_refused_before_anything_is_made(scenes: Path, tmp_path: Path) -> None:

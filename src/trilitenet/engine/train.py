@@ -132,13 +132,14 @@ class _LeftValidationError(Exception):
 class _FromPixels(nn.Module):
     """A network that takes (B, 3, H, W) uint8 RGB: Fabric would round normalised pixels to bf16 on their way in."""
 
-    def __init__(self, network: Any) -> None:
+    def __init__(self, network: Any, card: ModelCard) -> None:
         super().__init__()
         self.network = network
+        self.card = card
 
     def forward(self, images: Tensor) -> Any:
         """Normalise the pixels and run the network."""
-        return self.network(normalise_images(images))
+        return self.network(normalise_images(images, self.card.mean, self.card.std))
 
 
 class Trainer:
@@ -192,9 +193,12 @@ class Trainer:
             decay_all=config.decay_all,
         )
         compiled = torch.compile(self.network) if config.compile else self.network
-        self.model, self.optimiser = fabric.setup(_FromPixels(compiled), optimiser)
+        self.model, self.optimiser = fabric.setup(_FromPixels(compiled, card), optimiser)
         self.loss = loss
-        self.teacher = teacher and tuple(part.to(fabric.device).eval() for part in teacher)
+        self.teacher = None
+        if teacher is not None:
+            tutor = teacher[0].to(fabric.device).eval()
+            self.teacher = _FromPixels(tutor, tutor.card), teacher[1].to(fabric.device).eval()
         self.ema = MovingAverage(self.network, config.ema_decay, config.ema_ramp) if config.ema_decay else None
         interval = 20 if fabric.device.type == "cuda" else 1
         # The average follows no bad step that is seen at once.
@@ -359,7 +363,7 @@ class Trainer:
         if self.teacher:
             network, distil = self.teacher
             with torch.no_grad(), self.fabric.autocast():
-                lesson = network(normalise_images(images))
+                lesson = network(images)
             terms = terms._replace(total=terms.total + torch.stack(tuple(distil(outputs, lesson))).sum())
         return terms
 
