@@ -14,6 +14,7 @@ import kubernetes_validate
 import promql_parser
 import pytest
 import yaml
+from starlette.testclient import TestClient
 
 from tests.apps.server.conftest import MakeApp
 
@@ -95,6 +96,19 @@ def test_dashboard_and_alerts_ask_for_what_the_service_counts(make_app: MakeApp)
         names = set(re.findall(r"\b(?:trilitenet|process)_\w+|\bup\b", expression))
         assert names, expression
         assert names <= known, expression
+
+
+def test_probes_of_a_service_that_is_not_ready_are_no_refused_requests(make_app: MakeApp) -> None:
+    app = make_app()
+    TestClient(app).get("/readyz")
+    (counter,) = [family for family in app.service.metrics.registry.collect() if family.name == "trilitenet_requests"]
+    labels = [sample.labels for sample in counter.samples if sample.name.endswith("_total")]
+    assert [(entry["route"], entry["status"]) for entry in labels] == [("/readyz", "503")]
+    refused = [text for text in _expressions() if 'status="503"' in text]
+    assert len(refused) == 2
+    for expression in refused:
+        (routes,) = re.findall(r'trilitenet_requests_total\{route=~"([^"]*)",status="503"\}', expression)
+        assert not any(re.fullmatch(routes, entry["route"]) for entry in labels)
 
 
 def test_the_panels_do_not_overlap() -> None:
