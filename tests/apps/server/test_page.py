@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -27,7 +28,7 @@ from tests.apps.server.conftest import TOKEN, FakeBackend, Running, encode, pict
 from trilitenet.apps.server.application import create_app
 from trilitenet.apps.server.problems import BusyError
 from trilitenet.apps.server.settings import Settings
-from trilitenet.config import Thresholds
+from trilitenet.config import TASKS, Task, Thresholds
 from trilitenet.formats.writers.native import read_schema
 from trilitenet.inference.predictor import Predictor
 
@@ -266,6 +267,31 @@ def test_the_slider_begins_at_the_confidence_that_is_served(browser: Page, photo
         assert browser.see(photo).startswith("1 vehicle;")
         browser["confidence"].send_keys(Keys.HOME)
         assert browser["confidence-text"].text == "0.06"
+    finally:
+        assert running.stop()
+
+
+@pytest.mark.parametrize(
+    ("classes", "tasks", "title", "boxes"),
+    [
+        (("vehicle",), ("detection",), "Vehicles", "Vehicles"),
+        (("person", "bus"), TASKS, "Objects, drivable area and lane markings", "Objects"),
+        (("vehicle",), ("drivable", "lane"), "Drivable area and lane markings", "Vehicles"),
+    ],
+)
+def test_the_page_names_what_the_model_sees(
+    browser: Page, classes: tuple[str, ...], tasks: tuple[Task, ...], title: str, boxes: str
+) -> None:
+    backend = FakeBackend()
+    backend.card = dataclasses.replace(backend.card, class_names=classes, tasks=tasks)
+    running = Running(create_app(Predictor(backend), "tiny", Settings(threads=1, drain=0.1)))
+    try:
+        browser.open(running.url)
+        assert browser["tasks"].text == title
+        assert browser["name-detection"].text == boxes
+        assert browser["opacity-detection"].get_attribute("aria-label") == f"Opacity of {boxes.lower()}"
+        assert {name for name in TASKS if browser[f"show-{name}"].is_enabled()} == set(tasks)
+        assert browser["confidence"].is_displayed() == ("detection" in tasks)
     finally:
         assert running.stop()
 

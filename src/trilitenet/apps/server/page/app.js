@@ -1,6 +1,6 @@
 // The page: wires the controls to what is seen. No library, no build step, no request but to this service.
 
-import { ServiceError, getModel, pause, predict, predictBatch, setToken } from "./client.js";
+import { ServiceError, capital, getModel, pause, predict, predictBatch, setToken } from "./client.js";
 import { drawFrame, prepare, shownBoxes } from "./draw.js";
 import { openCamera, openClip, openPhoto } from "./sources.js";
 
@@ -86,10 +86,6 @@ async function showFrame(index, announce = true) {
   view.hidden = false;
   element("empty").hidden = true;
   element("save-overlay").disabled = element("save-json").disabled = false;
-  for (const name of LAYERS) {
-    const lacks = (name === "detection" ? current.boxes : current[name]) === null;
-    element(`show-${name}`).disabled = element(`opacity-${name}`).disabled = lacks;
-  }
   element("seek").value = index;
   element("seek-text").textContent = `${index + 1} / ${frames.length}`;
   const { milliseconds, roundTrip } = frame.result;
@@ -123,7 +119,7 @@ function tellCurrent() {
 async function meet() {
   try {
     const model = await getModel();
-    if (model.card.tasks.length < 3) element("tasks").textContent = model.card.tasks.join(", ");
+    showTasks(model.card);
     element("model").textContent = `model ${model.name} on ${model.backend}`;
     floor = Math.max(Math.min(floor, model.confidence), model.least_confidence);
     chunkSize = Math.min(chunkSize, model.max_images);
@@ -133,6 +129,18 @@ async function meet() {
     met = null;
     throw error;
   }
+}
+
+/** Name what the model sees, and leave out what it does not. */
+function showTasks({ class_names: classes, tasks }) {
+  const objects = classes.join() === "vehicle" ? "vehicles" : "objects";
+  const names = { detection: objects, drivable: "drivable area", lane: "lane markings" };
+  element("name-detection").textContent = capital(objects);
+  element("opacity-detection").setAttribute("aria-label", `Opacity of ${objects}`);
+  for (const name of LAYERS) element(`show-${name}`).disabled = element(`opacity-${name}`).disabled = !tasks.includes(name);
+  element("confidence").closest(".field").hidden = element("objects-details").hidden = !tasks.includes("detection");
+  const seen = LAYERS.filter((name) => tasks.includes(name)).map((name) => names[name]);
+  element("tasks").textContent = capital(new Intl.ListFormat("en-GB").format(seen));
 }
 
 /** Put a slider exactly on a value, which need not be round: its steps are counted from its least value. */
