@@ -244,6 +244,15 @@ def test_probes_follow_the_life_of_the_service(app: Application) -> None:
     assert client.get("/healthz").status_code == 503
 
 
+def test_a_wrong_address_or_method_is_told_what_is_right(client: TestClient) -> None:
+    nothing, method, triton = client.get("/predict"), client.get("/v1/predict"), client.get("/v2/models/tiny/config")
+    assert (nothing.status_code, method.status_code, triton.status_code) == (404, 405, 404)
+    assert method.headers["allow"] == "POST"
+    assert method.json()["error"]["message"] == "this address takes POST, not GET"
+    assert "/openapi.json" in nothing.json()["error"]["message"]
+    assert "/openapi.json" in triton.json()["error"]
+
+
 def test_a_backend_that_fails_is_an_answer_not_an_end(client: TestClient, jpeg: bytes, backend: FakeBackend) -> None:
     backend.error = RuntimeError("secret detail")
     answer = client.post("/v1/predict", content=jpeg)

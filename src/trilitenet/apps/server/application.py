@@ -115,10 +115,12 @@ async def _on_invalid(request: Request, error: Exception) -> Response:
 
 async def _on_http(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    code = {404: "not_found", 405: "method_not_allowed"}.get(error.status_code, "http")
-    return problem_response(
-        request, ProblemError(error.status_code, code, str(error.detail), dict(error.headers or {}))
-    )
+    headers = dict(error.headers or {})
+    code, message = {
+        404: ("not_found", "there is nothing at this address; /openapi.json lists what there is"),
+        405: ("method_not_allowed", f"this address takes {headers.get('Allow')}, not {request.method}"),
+    }.get(error.status_code, ("http", str(error.detail)))
+    return problem_response(request, ProblemError(error.status_code, code, message, headers))
 
 
 async def _on_error(request: Request, error: Exception) -> Response:
