@@ -259,6 +259,35 @@ def test_errors(root: Path, tmp_path: Path) -> None:
         PreparedDataset(tmp_path / "out", "val")
 
 
+def test_damaged_shards_are_named_and_made_anew(root: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    prepare(root, out, canvas=CANVAS, splits=["train"], shard_size=4)
+    shard, index = out / "train-000001.tar", out / "train-000001.index.jsonl"
+    whole = {path: path.read_bytes() for path in (shard, index)}
+
+    def read() -> list[str]:
+        return [sample.name for sample in PreparedDataset(out, "train")]
+
+    names = read()
+    for path, content, message in (
+        (shard, whole[shard][: len(whole[shard]) // 2], r"train-000001\.tar: is cut short; prepare the data set again"),
+        (index, whole[index][:-9], r"train-000001\.index\.jsonl: is damaged; prepare the data set again"),
+        (index, b"[]\n" + whole[index], r"train-000001\.index\.jsonl: is damaged; prepare the data set again"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(DataError, match=message):
+            read()
+        prepare(root, out, canvas=CANVAS, splits=["train"], shard_size=4)
+        assert {path: path.read_bytes() for path in whole} == whole
+        assert read() == names
+    for text, message in (("[1]", "format None"), ('{"format": 1}', "lacks canvas"), ("{", "cannot be read")):
+        (out / "prepared.json").write_text(text)
+        with pytest.raises(
+            DataError, match=rf"prepared\.json: {message}.*; remove .*out and prepare the data set again"
+        ):
+            read()
+
+
 def test_a_split_without_images_is_left_out(root: Path, tmp_path: Path) -> None:
     (root / "images" / "test").mkdir()
     assert set(prepare(root, tmp_path / "out", canvas=CANVAS)) == {"train", "val"}

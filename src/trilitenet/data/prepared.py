@@ -62,6 +62,8 @@ _LAYOUT: Final = 2
 """Shards of another layout are written anew: those of 1 had one mask of validity for both tasks."""
 
 _MASKS: Final = ("drivable", "lane", *VALID)
+_ENTRY: Final = frozenset({"name", "size", "boxes", "class_id", "ignored", "attributes", "parts"})
+"""What every line of an index holds."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -291,7 +293,7 @@ class PreparedDataset:
     @functools.cached_property
     def names(self) -> list[str]:
         """The images' names."""
-        return [json.loads(line)["name"] for line in self._lines]
+        return [self._entry(index)["name"] for index in range(len(self))]
 
     def __len__(self) -> int:
         return len(self._lines)
@@ -301,14 +303,14 @@ class PreparedDataset:
 
     def attributes(self, index: int) -> dict[str, str]:
         """Return the attributes of an image without decoding it."""
-        attributes: dict[str, str] = json.loads(self._lines[index])["attributes"]
+        attributes: dict[str, str] = self._entry(index)["attributes"]
         return attributes
 
     def has_labels(self, task: Task) -> bool:
         """Return whether an image is labelled for a task; looks up to the first."""
         if self._tasks is not None and task not in self._tasks:
             return False
-        entries = map(json.loads, self._lines)
+        entries = map(self._entry, range(len(self)))
         if task == "detection":
             return any(entry["boxes"] is not None for entry in entries)
         return any(f"{task}.npy" in entry["parts"] for entry in entries)
@@ -317,14 +319,20 @@ class PreparedDataset:
         """Return a hash of what the shard's index says of a sample: boxes, attributes, and the size of its parts."""
         return hashlib.sha256(self._lines[index]).hexdigest()[:16]
 
+    def _entry(self, index: int) -> dict[str, Any]:
+        return _parse_entry(self._lines[index], _index_name(self._shards[self._shard_of[index]]))
+
     def __getitem__(self, index: int) -> Sample:
         """Read a sample.
 
         Raises:
             DataError: If its shard is missing or broken.
         """
-        entry = json.loads(self._lines[index])
-        shard = _map_shard(self._place.file(self._shards[self._shard_of[index]]))
+        entry = self._entry(index)
+        path = self._place.file(self._shards[self._shard_of[index]])
+        shard = _map_shard(path)
+        if _end(entry) > len(shard):
+            raise DataError(f"{path}: is cut short; prepare the data set again")
         height, width = entry["size"]
         parts = {key: shard[start : start + length] for key, (start, length) in entry["parts"].items()}
         if "image.npy" in parts:
@@ -389,6 +397,27 @@ class _Place:
         return path
 
 
+def _parse_entry(line: bytes, name: str) -> dict[str, Any]:
+    """Return a line of the index called ``name``.
+
+    Raises:
+        DataError: If it is none.
+    """
+    try:
+        entry: dict[str, Any] = json.loads(line)
+        if entry.keys() >= _ENTRY:
+            return entry
+    except (ValueError, AttributeError):
+        pass
+    raise DataError(f"{name}: is damaged; prepare the data set again")
+
+
+def _end(entry: Mapping[str, Any]) -> int:
+    """Return where in its shard the parts of a sample end."""
+    end: int = max(start + length for start, length in entry["parts"].values())
+    return end
+
+
 def _map_shard(path: Path) -> NDArray[np.uint8]:
     try:
         state = path.stat()
@@ -421,10 +450,8 @@ def _write_shard(plan: _Plan, split: str, number: int, names: list[str]) -> int:
     index = plan.out / _index_name(path.name)
     dataset = DrivingDataset(plan.root, split, class_names=plan.class_names, names=names)
     made_from = _made_from(dataset)
-    if path.is_file() and index.is_file():
-        there = [json.loads(line) for line in index.read_bytes().splitlines()]
-        if [entry["name"] for entry in there] == names and there[0].get("made_from") == made_from:
-            return len(names)
+    if _is_there(path, index, names, made_from):
+        return len(names)
     entries: list[dict[str, Any]] = []
     with replacing(index) as index_part, replacing(path) as part:
         with tarfile.open(part, "w", format=tarfile.PAX_FORMAT) as tar:  # names of any length
@@ -439,6 +466,18 @@ def _write_shard(plan: _Plan, split: str, number: int, names: list[str]) -> int:
         entries[0]["made_from"] = made_from
         index_part.write_text("".join(json.dumps(entry) + "\n" for entry in entries), encoding="utf-8")
     return len(names)
+
+
+def _is_there(path: Path, index: Path, names: list[str], made_from: str) -> bool:
+    """Return whether a shard and its index are there for these images, and whole."""
+    if not (path.is_file() and index.is_file()):
+        return False
+    try:
+        there = [_parse_entry(line, index.name) for line in index.read_bytes().splitlines()]
+    except DataError:
+        return False
+    same = [entry["name"] for entry in there] == names and there[0].get("made_from") == made_from
+    return same and max(map(_end, there)) <= path.stat().st_size
 
 
 def _encode(sample: Sample, plan: _Plan) -> tuple[dict[str, bytes], dict[str, Any]]:
@@ -575,13 +614,17 @@ def _replace_state(plan: _Plan, splits: Mapping[str, Any], shards: Mapping[str, 
 
 def _read_state(folder: Path) -> dict[str, Any]:
     path = folder / PREPARED_FILE
+    cure = f"remove {folder} and prepare the data set again"
     try:
-        state: dict[str, Any] = json.loads(path.read_bytes())
+        state: Any = json.loads(path.read_bytes())
     except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read ({error}); prepare the data set again") from error
-    if state.get("format") != FORMAT:
-        raise DataError(f"{path}: format {state.get('format')!r}, not {FORMAT}; prepare the data set again")
-    return state
+        raise DataError(f"{path}: cannot be read ({error}); {cure}") from error
+    found = state.get("format") if isinstance(state, dict) else None
+    if found != FORMAT:
+        raise DataError(f"{path}: format {found!r}, not {FORMAT}; {cure}")
+    if missing := {"canvas", "class_names", "mask_above", "splits", "shards"} - state.keys():
+        raise DataError(f"{path}: lacks {', '.join(sorted(missing))}; {cure}")
+    return dict(state)
 
 
 def _files_of(root: Path, split: str) -> Iterator[Path]:
