@@ -24,6 +24,7 @@ from trilitenet.commands.train import _Display, train, validation_figures
 from trilitenet.commands.train_table import train_table
 from trilitenet.config import DEFAULT_ANCHORS, TASKS
 from trilitenet.data.description import read_description, write_description
+from trilitenet.data.loader import epoch_order
 from trilitenet.data.prepared import prepare
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.synthetic_files import write_dataset
@@ -789,6 +790,17 @@ def test_two_processes_follow_one(scenes: Path, tmp_path: Path) -> None:
         assert sum(parts) == pytest.approx(curves[devices][0])  # of one process alone it is not
     assert len(curves[1]) == len(curves[2]) == 6
     assert curves[2] == pytest.approx(curves[1], rel=0.1)
+
+
+@pytest.mark.slow
+def test_an_image_that_the_second_process_cannot_read_costs_no_step(scenes: Path, tmp_path: Path) -> None:
+    data = shutil.copytree(scenes, tmp_path / "data")
+    third = epoch_order(10, seed=0, epoch=0)[6]  # of the second batch: the second process has it
+    broken = sorted((data / "images" / "train").iterdir())[third]
+    broken.write_bytes(b"broken")
+    with pytest.raises(DataError, match=rf"{broken.name}: .*; once that is mended, --resume"):
+        train(**settings(data, tmp_path / "run", max_steps=2, devices=2))
+    assert state(tmp_path / "run")["step"] == 1
 
 
 def test_the_first_process_alone_tells_the_result(tmp_path: Path) -> None:

@@ -306,7 +306,7 @@ class Trainer:
         batches = self.loader.epoch(epoch, start=start * passes)
         sums = torch.zeros(len(LossTerms._fields) + 1, device=self.fabric.device)
         mark, since = time.perf_counter(), 0
-        while group := list(itertools.islice(batches, passes)):
+        while group := self._read(batches):
             if len(group) < passes:
                 break
             rate = self.schedule.apply(self.optimiser, self.step)
@@ -325,6 +325,26 @@ class Trainer:
             if self.step >= self.steps or stopped:
                 break
         self.guard.look()
+
+    def _read(self, batches: Iterator[Batch]) -> list[Batch]:
+        """Return the batches of an optimiser step; fewer, or none, at the end.
+
+        Raises:
+            DataError: If an image or label cannot be read by any of the processes: the first one is to save.
+        """
+        group: list[Batch] = []
+        failed: DataError | None = None
+        try:
+            group = list(itertools.islice(batches, self.config.accumulate))
+        except DataError as error:
+            failed = error
+        if self._any(failed is not None):
+            told = [None if failed is None else str(failed)]
+            if self.fabric.world_size > 1:
+                own, told = told[0], told * self.fabric.world_size
+                torch.distributed.all_gather_object(told, own)
+            raise DataError(next(filter(None, told))) from failed
+        return group
 
     def _train_step(self, batches: Sequence[Batch]) -> Tensor:
         """Run one optimiser step; return the loss terms and 1, or zeros if it was left out."""
@@ -428,10 +448,14 @@ class Trainer:
 
     def _stopped(self, stop: StopRequest) -> bool:
         """Return whether any process was asked to stop."""
+        return self._any(bool(stop))
+
+    def _any(self, here: bool) -> bool:
+        """Return whether something is so in any process."""
         if self.fabric.world_size == 1:
-            return bool(stop)
-        wish = torch.tensor(float(bool(stop)), device=self.fabric.device)
-        return bool(self.fabric.all_reduce(wish, reduce_op="sum") > 0)
+            return here
+        so = torch.tensor(float(here), device=self.fabric.device)
+        return bool(self.fabric.all_reduce(so, reduce_op="sum") > 0)
 
     def _log_losses(self, epoch: int, sums: Tensor, rate: float, speed: float) -> None:
         """Log the mean losses of all processes since the last time; every process takes part."""
