@@ -676,6 +676,9 @@ def test_resuming_takes_the_anchors_for_distillation_too(
     train(**settings(scenes, tmp_path, max_steps=2, teacher="tiny"), resume=True)
     for loss in made:
         torch.testing.assert_close(loss.get_buffer("student_anchors"), torch.tensor(own))
+    with pytest.raises(WeightsError, match="was trained with other anchors than are given now"):
+        train(**settings(scenes, tmp_path, max_steps=2, anchors=DEFAULT_ANCHORS), resume=True)
+    assert train(**settings(scenes, tmp_path, max_steps=2, anchors=own), resume=True).finished
 
 
 @pytest.mark.parametrize("part", ["network", "optimiser", "random"])

@@ -530,6 +530,14 @@ class Trainer:
                     f"{path}: was trained on {difference}; give the same --data and --classes, or start anew with "
                     "--overwrite or another --output"
                 )
+        own = state["network"].get("anchors")
+        if self.config.anchors is not None and not (
+            isinstance(own, Tensor) and torch.equal(own, self.network.anchors.cpu())
+        ):
+            raise WeightsError(
+                f"{path}: was trained with other anchors than are given now; leave them out to go on with its own, or "
+                "start anew with --overwrite"
+            )
         try:
             self._take_over(state)
         except (RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
