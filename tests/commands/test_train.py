@@ -429,7 +429,9 @@ def test_overwriting_leaves_nothing_of_the_earlier_run(
     assert not list(output.glob("best-*"))
     assert not (output / "results" / "old.jpg").exists()
     assert (output / "notes.txt").read_text() == "mine"
+    (output / ".last.ckpt.0123abcd.part").write_bytes(b"cut short")
     train(resume=True, **options, max_steps=4)
+    assert not list(output.glob(".*"))
     assert read_card(output / "best-drivable.safetensors").metrics["best drivable"] < 0.5
 
 
