@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import logging
 import os
 from collections.abc import Callable
@@ -331,3 +332,23 @@ def test_names_that_differ_in_an_escape_alone_are_two(root: Path, tmp_path: Path
     prepare(root, tmp_path / "out", canvas=CANVAS, splits=["test"])
     packed = PreparedDataset(tmp_path / "out", "test")
     assert {sample.name: int(sample.image.max()) for sample in packed} == {"a.b": 0, "a%2Eb": 100}
+
+
+def test_an_own_car_mask_elsewhere(root: Path, tmp_path: Path) -> None:
+    elsewhere = (root / "bonnet.png").rename(tmp_path / "bonnet.png")
+    describe(root, f"ego_mask: {elsewhere}\n")
+    prepare(root, canvas=CANVAS)
+    assert isinstance(open_dataset(root, "train", canvas=CANVAS), PreparedDataset)
+    os.utime(elsewhere, ns=(1, 1))
+    assert isinstance(open_dataset(root, "train", canvas=CANVAS), DrivingDataset)
+
+
+def test_a_full_disk_is_told(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    prepare(root, tmp_path / "out", canvas=CANVAS, splits=["val"])
+
+    def full(self: Path, *args: Any, **more: Any) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OutputError, match="out: cannot be written"):
+        prepare(root, tmp_path / "out", canvas=CANVAS, splits=["val"])

@@ -21,6 +21,7 @@ import hashlib
 import io
 import json
 import logging
+import os
 import re
 import shutil
 import tarfile
@@ -33,13 +34,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import Task, check_size
-from trilitenet.data.description import read_description
+from trilitenet.data.description import DESCRIPTION_FILE, read_description
 from trilitenet.data.reading import (
-    DETECTION_FOLDER,
-    DRIVABLE_FOLDER,
     IMAGE_ENDINGS,
     IMAGE_FOLDER,
-    LANE_FOLDER,
+    LABEL_FILES,
     DrivingDataset,
     SampleSource,
     decode_image,
@@ -169,8 +168,8 @@ def prepare(
     ]
     total = sum(map(len, datasets.values()))
     done = 0
-    _forget(plan, datasets)
     with writing(out):
+        _forget(plan, datasets)
         for count in _run_jobs(plan, jobs, workers):
             done += count
             if progress:
@@ -627,41 +626,38 @@ def _read_state(folder: Path) -> dict[str, Any]:
     return dict(state)
 
 
-def _files_of(root: Path, split: str) -> Iterator[Path]:
-    for folder in (IMAGE_FOLDER, DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER):
+def _files_of(root: Path, split: str) -> Iterator[str]:
+    for folder in (IMAGE_FOLDER, *(folder for folder, _ in LABEL_FILES.values())):
         if (root / folder / split).is_dir():
-            yield from (root / folder / split).iterdir()
+            yield from (f"{folder}/{split}/{path.name}" for path in (root / folder / split).iterdir())
     yield from _common_files(root)
 
 
-def _common_files(root: Path) -> Iterator[Path]:
-    """Return the files that say something of every image."""
+def _common_files(root: Path) -> tuple[str, ...]:
+    """Return the files that say something of every image, where there are such."""
     description = read_description(root)
-    own_car = (description.ego_mask, *description.ego_masks.values())
-    for name in ("dataset.yaml", "index.csv", *filter(None, own_car)):
-        if (root / name).is_file():
-            yield root / name
+    return (DESCRIPTION_FILE, "index.csv", *filter(None, (description.ego_mask, *description.ego_masks.values())))
 
 
 def _fingerprint(root: Path, split: str) -> str:
     """Return what changes when a split changes: the SHA-256 of its files' names, sizes and when they were written."""
-    return _digest(root, sorted(_files_of(root, split)))
+    return _digest(root, sorted(_files_of(root, split), key=lambda file: file.split("/")))
 
 
 def _made_from(dataset: DrivingDataset) -> str:
     """Return the SHA-256 of which files samples are made from, how large they are and when they were written."""
-    paths = [*_common_files(dataset.root)]
+    files = [*_common_files(dataset.root)]
     for index, name in enumerate(dataset.names):
-        paths += [dataset.image_path(index), dataset.root / DETECTION_FOLDER / dataset.split / f"{name}.json"]
-        paths += [dataset.root / folder / dataset.split / f"{name}.png" for folder in (DRIVABLE_FOLDER, LANE_FOLDER)]
-    return _digest(dataset.root, paths)
+        files.append(f"{IMAGE_FOLDER}/{dataset.split}/{dataset.image_path(index).name}")
+        files += [f"{folder}/{dataset.split}/{name}{ending}" for folder, ending in LABEL_FILES.values()]
+    return _digest(dataset.root, files)
 
 
-def _digest(root: Path, paths: Iterable[Path]) -> str:
-    """Return the SHA-256 of the names, sizes and times of writing of those files that are there."""
+def _digest(root: Path, files: Iterable[str]) -> str:
+    """Return the SHA-256 of the names, sizes and times of writing of those files below ``root`` that are there."""
     digest = hashlib.sha256(f"layout {_LAYOUT}\n".encode())
-    for path in paths:
-        with contextlib.suppress(FileNotFoundError):
-            stat = path.stat()
-            digest.update(f"{path.relative_to(root)}\n{stat.st_size} {stat.st_mtime_ns}\n".encode())
+    for file in files:
+        with contextlib.suppress(OSError, ValueError):
+            stat = (root / file).stat()
+            digest.update(os.fsencode(f"{file}\n{stat.st_size} {stat.st_mtime_ns}\n"))
     return digest.hexdigest()

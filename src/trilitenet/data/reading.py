@@ -482,14 +482,13 @@ def _image_files(root: Path, split: str) -> dict[str, str]:
     if not folder.is_dir():
         raise DataError(f"{root}: no folder {IMAGE_FOLDER}/{split}; expected the published layout, see docs/data.md")
     files: dict[str, str] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in IMAGE_ENDINGS:
+    for file in sorted(path.name for path in folder.iterdir()):  # as text, which is many times as fast
+        name, dot, ending = file.rpartition(".")
+        if not name or f"{dot}{ending}".lower() not in IMAGE_ENDINGS:
             continue
-        if path.stem in files:
-            raise DataError(
-                f"{folder}: {files[path.stem]} and {path.name} would have the same labels; remove or rename one"
-            )
-        files[path.stem] = path.name
+        if name in files:
+            raise DataError(f"{folder}: {files[name]} and {file} would have the same labels; remove or rename one")
+        files[name] = file
     if not files:
         raise DataError(f"{folder}: no images ({', '.join(IMAGE_ENDINGS)})")
     return files
