@@ -3,11 +3,12 @@ from __future__ import annotations
 import errno
 import os
 import stat
+import time
 from pathlib import Path
 
 import pytest
 
-from trilitenet.errors import OutputError, free_name, part_of, replacing, write_file, writing
+from trilitenet.errors import FreeNames, OutputError, part_of, replacing, write_file, writing
 
 
 def interrupt(path: Path, error: BaseException) -> None:
@@ -72,5 +73,13 @@ def test_a_link_stays_a_link(tmp_path: Path) -> None:
 
 
 def test_names_that_are_taken_get_a_number() -> None:
-    assert free_name("a", set()) == "a"
-    assert free_name("a", {"a", "a-2"}) == "a-3"
+    free = FreeNames()
+    assert [free.give(name) for name in ("a", "a-2", "a", "b", "a", "a-2")] == ["a", "a-2", "a-3", "b", "a-4", "a-2-2"]
+
+
+def test_a_hundred_thousand_things_of_one_name_are_named_at_once() -> None:
+    free = FreeNames()
+    began = time.process_time()
+    names = [free.give("frame") for _ in range(100_000)]
+    assert time.process_time() - began < 2  # half an hour, were each name looked for from 2 on
+    assert names[-1] == "frame-100000"

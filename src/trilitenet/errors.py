@@ -24,7 +24,7 @@ import os
 import secrets
 import stat
 import zlib
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Final
@@ -34,6 +34,7 @@ __all__ = [
     "BackendError",
     "ConfigError",
     "DataError",
+    "FreeNames",
     "InputError",
     "MissingExtraError",
     "OutputError",
@@ -43,7 +44,6 @@ __all__ = [
     "WeightsError",
     "brief",
     "did_you_mean",
-    "free_name",
     "import_extra",
     "part_of",
     "replacing",
@@ -172,13 +172,20 @@ def part_of(path: Path) -> Path:
     return path.with_name(name)
 
 
-def free_name(name: str, taken: Collection[str]) -> str:
-    """Return a name that is not taken: itself, or with ``-2``, ``-3`` ... at the end."""
-    number, free = 1, name
-    while free in taken:
-        number += 1
-        free = f"{name}-{number}"
-    return free
+class FreeNames:
+    """Gives names of which no two are the same: the second ``a`` becomes ``a-2``."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, int] = {}  # given name -> the last number that was put at its end
+
+    def give(self, name: str) -> str:
+        """Return the name, or one with ``-2``, ``-3`` ... at the end if it was given before."""
+        free = name
+        while free in self._last:
+            self._last[name] += 1
+            free = f"{name}-{self._last[name]}"
+        self._last[free] = 1
+        return free
 
 
 @contextlib.contextmanager

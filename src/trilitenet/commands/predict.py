@@ -27,10 +27,10 @@ from trilitenet.errors import (
     LONGEST_NAME,
     BackendError,
     ConfigError,
+    FreeNames,
     InputError,
     OutputError,
     ShapeError,
-    free_name,
     part_of,
     replacing,
     writing,
@@ -583,12 +583,8 @@ def _numbered(file: str) -> str:
 
 def _allot_stems(names: Sequence[str]) -> dict[str, str]:
     """Return a file name without ending for each source; the second ``a`` becomes ``a-2``."""
-    stems: dict[str, str] = {}
-    taken: set[str] = set()
-    for name in dict.fromkeys(names):
-        stems[name] = free_name(PurePath(name).stem or "image", taken)
-        taken.add(stems[name])
-    return stems
+    free = FreeNames()
+    return {name: free.give(PurePath(name).stem or "image") for name in dict.fromkeys(names)}
 
 
 def _write_jpeg(path: Path, image: NDArray[np.uint8]) -> None:

@@ -29,7 +29,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.errors import ConfigError, InputError, free_name, import_extra
+from trilitenet.errors import ConfigError, FreeNames, InputError, import_extra
 from trilitenet.processing.images import read_image
 
 __all__ = [
@@ -518,10 +518,9 @@ def _check_rate(rate: float) -> None:
 
 def _tell_apart(readers: Iterable[FrameReader]) -> None:
     """Number readers of one name, such as ``a/%d.jpg`` and ``a/%d.png``, or two queries of a URL: ``a``, ``a-2`` ..."""
-    taken: set[str] = set()
+    free = FreeNames()
     for reader in readers:
-        reader.name = free_name(reader.name, taken)
-        taken.add(reader.name)
+        reader.name = free.give(reader.name)
 
 
 def _printable(name: str) -> str:

@@ -25,7 +25,7 @@ from pathlib import Path, PurePath
 from types import FrameType, TracebackType
 from typing import IO, TYPE_CHECKING, Any, ClassVar, Final
 
-from trilitenet.errors import ConfigError, OutputError, did_you_mean, free_name, part_of, writing
+from trilitenet.errors import ConfigError, FreeNames, OutputError, did_you_mean, part_of, writing
 from trilitenet.structures import Perception
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class Writer(abc.ABC):
         self.files: list[Path] = []
         self._begun: list[Path] = []
         self._stems: dict[str, str] = {}
-        self._taken: set[str] = set()
+        self._free = FreeNames()
         self._names: Counter[str] = Counter()
         self._unnamed = 0
         self._empty = True
@@ -177,10 +177,8 @@ class Writer(abc.ABC):
             self._unnamed += 1
             return f"image-{self._unnamed:06d}"
         if source not in self._stems:
-            name = free_name(PurePath(source).stem or "image", self._taken)
-            self._stems[source] = name
+            self._stems[source] = self._free.give(PurePath(source).stem or "image")
             self._names[PurePath(source).name] += 1
-            self._taken.add(name)
         return self._stems[source]
 
     def image_name(self, perception: Perception) -> str:
