@@ -4,7 +4,7 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import cv2
 import numpy as np
@@ -15,7 +15,16 @@ from tests.formats.readers import raw_bdd
 from trilitenet.data.converting import ConversionOptions, convert, drivable_mask, lane_mask
 from trilitenet.data.description import read_description
 from trilitenet.data.reading import DrivingDataset
-from trilitenet.data.records import AreaLabel, CocoRuns, ImageRecord, LaneLabel, MaskFile, ObjectLabel, RowRuns
+from trilitenet.data.records import (
+    AreaLabel,
+    CocoRuns,
+    ImageRecord,
+    LaneLabel,
+    ListedRecords,
+    MaskFile,
+    ObjectLabel,
+    RowRuns,
+)
 from trilitenet.errors import ConfigError, DataError, OutputError
 from trilitenet.formats.readers.bdd100k import BddSource, read_bdd100k
 
@@ -397,3 +406,12 @@ def test_shapes_of_too_few_points_are_counted(tmp_path: Path) -> None:
     assert report.lanes["train"] == {"outlines": 1, "single lines": 1}
     whole = picture(tmp_path / "raw/b.png", drivable=areas[3:], lane=lines[2:])
     assert convert(Records(train=[whole]), tmp_path / "other").dropped == {"train": {}}
+
+
+@pytest.mark.parametrize("images", ["link", "copy", "symlink"])
+def test_images_of_long_names_are_placed(tmp_path: Path, images: Literal["link", "copy", "symlink"]) -> None:
+    image = tmp_path / f"{'n' * 250}.jpg"
+    cv2.imwrite(str(image), np.zeros((36, 64, 3), np.uint8))
+    source = ListedRecords({"train": [ImageRecord(image.stem, image, objects=())]}, origin={"kind": "test"})
+    convert(source, tmp_path / "out", ConversionOptions(images=images))
+    assert DrivingDataset(tmp_path / "out", "train").names == [image.stem]

@@ -519,7 +519,7 @@ def _place_image(source: Path, target: Path, options: ConversionOptions) -> None
         there, here = target.stat(), source.stat()
         if there.st_ino == here.st_ino or (there.st_size, there.st_mtime_ns) == (here.st_size, here.st_mtime_ns):
             return
-    part = target.with_name(f".{target.name}.part")
+    part = target.with_name(f".{os.getpid()}.part")  # short, for names may be as long as file systems take them
     part.unlink(missing_ok=True)
     if options.images == "link":
         with contextlib.suppress(OSError):
