@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 
+import cv2
 import pytest
 
 from trilitenet.processing.cores import ProcessPool
@@ -61,3 +62,12 @@ def test_a_pool_works_and_tells_errors() -> None:
         assert list(pool.map(abs, [-1, 2, -3])) == [1, 2, 3]
         with pytest.raises(ValueError, match="invalid literal"):
             pool.submit(int, "x").result()
+
+
+def threads() -> int:
+    return cv2.getNumThreads()
+
+
+def test_processes_share_the_cores_whatever_opencv_would_take() -> None:
+    with ProcessPool(1) as pool:
+        assert pool.submit(threads).result() == 1

@@ -19,7 +19,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -348,12 +347,8 @@ def _run(job: _Job, work: list[tuple[str, str]], workers: int) -> Iterator[_Fact
     if workers <= 0 or len(work) < 64:
         yield from map(job, work)
         return
-    with ProcessPool(workers, _start) as pool:
+    with ProcessPool(workers) as pool:
         yield from pool.map(job, work, chunksize=64)
-
-
-def _start() -> None:
-    cv2.setNumThreads(1)
 
 
 def _look(job: _Job, split: str, file: str) -> _Facts:

@@ -343,7 +343,6 @@ _job: _Job | None = None
 def _start(job: _Job) -> None:
     global _job
     _job = job
-    cv2.setNumThreads(1)
 
 
 def _work(item: tuple[str, dict[str, Any] | None]) -> dict[str, Any]:

@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
 from typing import Any, TypeVar
 
+import cv2
+
 __all__ = ["ProcessPool", "held_back", "usable_cores"]
 
 T = TypeVar("T")
@@ -26,7 +28,7 @@ class ProcessPool(concurrent.futures.ProcessPoolExecutor):
     """Processes that Ctrl-C in the terminal, which reaches all of them, ends without a word.
 
     What a process is at is interrupted, so that it cleans up; what waits is forgotten. Processes whose own was killed
-    end, too.
+    end, too. OpenCV takes one thread in each.
 
     Args:
         workers: How many.
@@ -77,6 +79,7 @@ def _begin(heeds: bool, initializer: Callable[..., object] | None, initargs: tup
     signal.signal(signal.SIGINT, _stop if heeds else signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    cv2.setNumThreads(1)  # the processes are the parallelism
     if initializer is not None:
         initializer(*initargs)
 
