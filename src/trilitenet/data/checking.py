@@ -27,12 +27,9 @@ from trilitenet.config import DEFAULT_ANCHORS, LONG_SIDE, Anchors
 from trilitenet.data.description import DatasetDescription, MaskMeaning, class_table, read_description
 from trilitenet.data.prepared import is_prepared
 from trilitenet.data.reading import (
-    DETECTION_FOLDER,
-    DRIVABLE_FOLDER,
     IMAGE_ENDINGS,
     IMAGE_FOLDER,
     LABEL_FILES,
-    LANE_FOLDER,
     decode_mask,
     is_crowd,
     read_index,
@@ -40,7 +37,7 @@ from trilitenet.data.reading import (
 from trilitenet.errors import DataError, import_extra
 from trilitenet.processing.boxes import best_side_ratio
 from trilitenet.processing.cores import ProcessPool
-from trilitenet.processing.images import upright_size
+from trilitenet.processing.images import BROKEN, upright_size
 
 __all__ = ["KINDS", "CheckReport", "Finding", "check_dataset", "detect_layout"]
 
@@ -89,8 +86,6 @@ _SLACK: Final = 1.0
 _MIN_ANCHOR_RECALL: Final = 0.98
 _MIN_BOXES: Final = 50
 """Anchors are judged by no fewer boxes."""
-
-_MASK_FOLDERS: Final = {"drivable": DRIVABLE_FOLDER, "lane": LANE_FOLDER}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,7 +187,7 @@ def detect_layout(root: str | Path) -> tuple[str, str]:
     root = Path(root)
     if is_prepared(root):
         return "prepared", "a prepared data set (prepared.json)"
-    annotated = [folder for folder in (DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER) if (root / folder).is_dir()]
+    annotated = [folder for folder, _ in LABEL_FILES.values() if (root / folder).is_dir()]
     if (root / IMAGE_FOLDER).is_dir() and annotated:
         return "published", f"the published layout ({', '.join([IMAGE_FOLDER, *annotated])})"
     if (
@@ -362,16 +357,16 @@ def _look(job: _Job, split: str, file: str) -> _Facts:
     objects: dict[str, int] = {}
     box_sizes = np.zeros((0, 2), np.float32)
     attributes: dict[str, str] = {}
-    document = job.root / DETECTION_FOLDER / split / f"{name}.json"
-    if document.is_file():
-        labelled.append("detection")
-        objects, box_sizes, attributes = _look_at_boxes(job, document, size, faults)
-    for task, folder in _MASK_FOLDERS.items():
-        mask = job.root / folder / split / f"{name}.png"
-        if mask.is_file():
-            labelled.append(task)
+    for task, (folder, ending) in LABEL_FILES.items():
+        label = job.root / folder / split / f"{name}{ending}"
+        if not label.is_file():
+            continue
+        labelled.append(task)
+        if task == "detection":
+            objects, box_sizes, attributes = _look_at_boxes(job, label, size, faults)
+        else:
             meaning = job.description.drivable if task == "drivable" else job.description.lane
-            part = _look_at_mask(mask, f"{folder}/{split}/{name}.png", meaning, size, faults)
+            part = _look_at_mask(label, f"{folder}/{split}/{name}{ending}", meaning, size, faults)
             if part is not None:
                 parts[task] = part
     if not labelled:
@@ -393,7 +388,7 @@ def _look_at_image(
             # JPEGs are decoded at 1/2, 1/4 or 1/8: a whole file is read, in a part of the time.
             image.draft("L", (64, 64))
             grey = image.convert("L").resize((64, 64), Image.Resampling.BILINEAR)
-    except (OSError, SyntaxError, ValueError, EOFError, IndexError, Image.DecompressionBombError) as error:
+    except BROKEN as error:
         faults.append(("image-unreadable", f"{where} ({_reason(error)})"))
         return None, digest, 0, b""
     bits = _perceptual_hash(grey)
@@ -460,7 +455,7 @@ def _look_at_mask(
     try:
         with Image.open(path) as picture:
             picture.load()
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+    except BROKEN as error:
         faults.append(("mask-unreadable", f"{where} ({_reason(error)})"))
         return None
     found = (picture.height, picture.width)

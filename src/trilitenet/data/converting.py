@@ -59,6 +59,7 @@ from trilitenet.data.records import (
 )
 from trilitenet.errors import ConfigError, DataError, OutputError, replacing, writing
 from trilitenet.processing.cores import ProcessPool
+from trilitenet.processing.images import BROKEN
 
 __all__ = ["ConversionOptions", "ConversionReport", "convert", "drivable_mask", "lane_mask"]
 
@@ -473,7 +474,7 @@ def _mask_of(file: MaskFile, size: tuple[int, int], *, keep_alternative: bool) -
                 pixels = np.asarray(plain).astype(np.int64)
                 if picture.mode == "1" and 1 not in file.values:
                     pixels *= 255  # a picture of two levels has them as 0 and 255 everywhere else
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except BROKEN as error:
         raise DataError(f"{file.path}: not a mask that can be read ({error})") from error
     if pixels.shape != size:
         raise DataError(f"{file.path}: mask of {pixels.shape[1]}x{pixels.shape[0]}, image of {size[1]}x{size[0]}")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trilitenet.errors import DataError, ShapeError
-from trilitenet.processing.images import upright_size
+from trilitenet.processing.images import BROKEN, upright_size
 from trilitenet.processing.serialise import decode_mask
 
 __all__ = [
@@ -226,7 +226,7 @@ def image_size(path: Path) -> tuple[int, int]:
     try:
         with Image.open(path) as image:
             return upright_size(image)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except BROKEN as error:
         raise DataError(f"{path}: not an image that can be read ({error})") from error
 
 

@@ -15,10 +15,10 @@ from PIL import ExifTags, Image
 
 from trilitenet.errors import InputError, ShapeError
 
-__all__ = ["read_image", "to_rgb", "upright_size"]
+__all__ = ["BROKEN", "read_image", "to_rgb", "upright_size"]
 
 
-_BROKEN = (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error, Image.DecompressionBombError)
+BROKEN: Final = (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error, Image.DecompressionBombError)
 """What Pillow's decoders raise on broken files."""
 
 _TURNS: Final[dict[int, Callable[[NDArray[np.uint8]], NDArray[np.uint8]]]] = {
@@ -80,7 +80,7 @@ def read_image(image: str | Path | bytes | Image.Image | NDArray[Any]) -> NDArra
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             opened = Image.open(io.BytesIO(data))
-    except _BROKEN as error:
+    except BROKEN as error:
         if data[4:8] == b"ftyp" and data[8:12] in _HEIF:
             raise InputError(f"{name}: HEIC images cannot be read; save it as JPEG") from error
         raise InputError(f"{name}: is not an image that can be read ({_reason(error)})") from error
@@ -131,7 +131,7 @@ def _decode(image: Image.Image, name: str) -> NDArray[np.uint8]:
         return array
     except InputError:
         raise
-    except _BROKEN as error:
+    except BROKEN as error:
         raise InputError(f"{name}: is broken or truncated ({_reason(error)})") from error
 
 
@@ -147,7 +147,7 @@ def _orientation(image: Image.Image) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of damaged tags
             return image.getexif().get(ExifTags.Base.Orientation, 1)
-    except (*_BROKEN, TypeError):
+    except (*BROKEN, TypeError):
         return 1
 
 
