@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from trilitenet.data.sample import Sample
 from trilitenet.errors import ShapeError
+from trilitenet.processing.boxes import xyxy_to_cxcywh
 
 __all__ = ["NOT_LABELLED", "Batch", "collate"]
 
@@ -93,14 +94,14 @@ def collate(samples: Sequence[Sample]) -> Batch:
                     target[index][~counted] = NOT_LABELLED
         if sample.boxes is not None and sample.class_id is not None and len(sample.boxes):
             rows = np.empty((len(sample.boxes), 6), np.float32)
-            rows[:, 0], rows[:, 1], rows[:, 2:] = index, sample.class_id, _centred(sample.boxes)
+            rows[:, 0], rows[:, 1], rows[:, 2:] = index, sample.class_id, xyxy_to_cxcywh(sample.boxes)
             boxes.append(rows)
         outside = sample.ignored
         if sample.valid is not None:
             outside = np.concatenate([outside, _strips(sample.valid)])
         if len(outside):
             rows = np.empty((len(outside), 5), np.float32)
-            rows[:, 0], rows[:, 1:] = index, _centred(outside)
+            rows[:, 0], rows[:, 1:] = index, xyxy_to_cxcywh(outside)
             ignored.append(rows)
     return Batch(
         images=torch.from_numpy(images),
@@ -111,11 +112,6 @@ def collate(samples: Sequence[Sample]) -> Batch:
         lane=torch.from_numpy(lane),
         names=tuple(sample.name for sample in samples),
     )
-
-
-def _centred(xyxy: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return centre x, centre y, width, height of boxes."""
-    return np.concatenate([(xyxy[:, :2] + xyxy[:, 2:]) / 2, xyxy[:, 2:] - xyxy[:, :2]], axis=1)
 
 
 def _strips(valid: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -97,7 +97,7 @@ def night(image: Image, rng: np.random.Generator) -> Image:
     gain = np.clip(dark + cone, 0, 1).astype(np.float32)[..., None]
     tint = np.array([0.92, 0.96, 1.1], np.float32)
     lit = np.clip(image * gain * tint, 0, 255)
-    shining = (np.minimum(image.min(axis=2), 255).astype(np.float32)[..., None] - 235).clip(0, 20) / 20
+    shining = (image.min(axis=2).astype(np.float32)[..., None] - 235).clip(0, 20) / 20
     glow = image * shining * 0.6
     grain = np.empty((height, width, 1), np.float32)
     cv2.setRNGSeed(int(rng.integers(1 << 31)))

@@ -93,17 +93,17 @@ def shrink(sample: Sample, canvas: tuple[int, int], mask_above: int = 1) -> Samp
     bare = dataclasses.replace(box, canvas=box.resized, top=0, left=0)
     factor = np.array([width / sample.size[1], height / sample.size[0]] * 2)
 
-    def mask(values: NDArray[np.uint8] | None, above: int) -> NDArray[np.uint8] | None:
-        return None if values is None else bare.mask(values * np.uint8(255), above)
+    def mask(values: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:
+        return None if values is None else bare.mask(values.view(np.bool_), mask_above)
 
     return dataclasses.replace(
         sample,
         image=bare.image(sample.image),
         boxes=None if sample.boxes is None else (sample.boxes * factor).astype(np.float32),
         ignored=(sample.ignored * factor).astype(np.float32),
-        drivable=mask(sample.drivable, mask_above),
-        lane=mask(sample.lane, mask_above),
-        **sample.change_valid(lambda valid: bare.mask((~valid).view(np.uint8) * np.uint8(255), 1) == 0),
+        drivable=mask(sample.drivable),
+        lane=mask(sample.lane),
+        **sample.change_valid(lambda valid: bare.mask(~valid) == 0),
     )
 
 

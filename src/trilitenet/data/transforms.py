@@ -22,6 +22,7 @@ from trilitenet.config import check_size
 from trilitenet.data import photometric
 from trilitenet.data.sample import VALID, Sample
 from trilitenet.errors import ConfigError
+from trilitenet.processing.boxes import clip_boxes
 from trilitenet.processing.letterbox import PAD_VALUE, Letterbox
 
 __all__ = [
@@ -303,12 +304,12 @@ class EvalTransform:
         return dataclasses.replace(
             sample,
             image=box.image(sample.image),
-            boxes=None if sample.boxes is None else box.boxes(sample.boxes).astype(np.float32),
-            ignored=box.boxes(sample.ignored).astype(np.float32),
-            drivable=_letterbox_mask(sample.drivable, box),
-            lane=_letterbox_mask(sample.lane, box),
+            boxes=None if sample.boxes is None else box.boxes(sample.boxes),
+            ignored=box.boxes(sample.ignored),
+            drivable=None if sample.drivable is None else box.mask(sample.drivable.view(np.bool_)),
+            lane=None if sample.lane is None else box.mask(sample.lane.view(np.bool_)),
             # What is outside the image is not the own car, so the padding stays valid.
-            **sample.change_valid(lambda valid: box.mask((~valid).astype(np.uint8) * 255) == 0),
+            **sample.change_valid(lambda valid: box.mask(~valid) == 0),
         )
 
 
@@ -459,7 +460,7 @@ def _crop(sample: Sample, top: int, left: int, height: int, width: int) -> Sampl
 
     def cut(boxes: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         moved = boxes - np.array([left, top, left, top], np.float32)
-        return moved, np.clip(moved, 0, np.array([width, height, width, height], np.float32))
+        return moved, clip_boxes(moved, (height, width))
 
     boxes, class_id = sample.boxes, sample.class_id
     if boxes is not None and class_id is not None:
@@ -535,12 +536,6 @@ def _still_valid(outside: NDArray[np.uint8] | None) -> NDArray[np.bool_] | None:
     return None if outside is None else outside <= 1
 
 
-def _letterbox_mask(mask: NDArray[np.uint8] | None, box: Letterbox) -> NDArray[np.uint8] | None:
-    if mask is None:
-        return None
-    return (box.mask(mask * np.uint8(255)) > 0).view(np.uint8)
-
-
 def _move_boxes(
     boxes: NDArray[np.float32], box: Letterbox, matrix: NDArray[np.float64], scale: float, *, strict: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -564,9 +559,7 @@ def _move_boxes(
     corners = np.stack([resized[:, [0, 1]], resized[:, [2, 1]], resized[:, [2, 3]], resized[:, [0, 3]]], axis=1) - 0.5
     moved = corners @ matrix[:, :2].T + matrix[:, 2] + 0.5
     hull = np.concatenate([moved.min(axis=1), moved.max(axis=1)], axis=1).astype(np.float32)
-    clipped: NDArray[np.float32] = hull.copy()
-    np.clip(clipped[:, 0::2], 0, box.canvas[1], out=clipped[:, 0::2])
-    np.clip(clipped[:, 1::2], 0, box.canvas[0], out=clipped[:, 1::2])
+    clipped = clip_boxes(hull, box.canvas)
     if strict:
         # The published rule compares with the scaled box, not with the hull of the rotated one.
         keep = kept_boxes((resized * scale).astype(np.float32), clipped)
