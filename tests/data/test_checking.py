@@ -67,6 +67,11 @@ def unlink(*paths: Path) -> None:
         path.unlink()
 
 
+def link_to_nothing(path: Path) -> None:
+    path.unlink()
+    path.symlink_to("moved.jpg")
+
+
 def annotate(root: Path, *items: dict[str, object]) -> None:
     write_annotation(root, "train", "train_0000", list(items))
 
@@ -100,6 +105,7 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "truncated image": ("image-unreadable", lambda root: truncate(root / "images/train/train_0001.jpg")),
     "empty image": ("image-unreadable", lambda root: (root / "images/val/val_0001.jpg").write_bytes(b"")),
     "text as image": ("image-unreadable", lambda root: (root / "images/val/val_0002.jpg").write_text("hello")),
+    "link to nothing": ("image-unreadable", lambda root: link_to_nothing(root / "images/train/train_0004.jpg")),
     "broken annotation": (
         "annotation-unreadable",
         lambda root: (root / "det_annotations/train/train_0001.json").write_text('{"frames": ['),

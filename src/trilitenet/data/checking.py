@@ -42,7 +42,7 @@ from trilitenet.processing.images import BROKEN, upright_size
 __all__ = ["KINDS", "CheckReport", "Finding", "check_dataset", "detect_layout"]
 
 KINDS: Final[dict[str, str]] = {
-    "image-unreadable": "the image is empty, truncated or no image",
+    "image-unreadable": "the image is empty, truncated, no image, or a link to nothing",
     "annotation-unreadable": "the annotation is not JSON, or not in the per-image form",
     "mask-unreadable": "the mask is empty, truncated or no image",
     "mask-size": "the mask has another size than its image",
@@ -252,7 +252,7 @@ def check_dataset(
     job = _Job(root, description, class_table(description.class_names, description.classes))
     names = {
         folder.name: sorted(
-            path.name for path in folder.iterdir() if path.is_file() and path.suffix.lower() in IMAGE_ENDINGS
+            path.name for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS and not path.is_dir()
         )
         for folder in sorted((root / IMAGE_FOLDER).iterdir())
         if folder.is_dir()
@@ -380,7 +380,12 @@ def _look_at_image(
     path: Path, where: str, faults: list[tuple[str, str]]
 ) -> tuple[tuple[int, int] | None, bytes, int, bytes]:
     """Return (height, width), a digest of the file, a perceptual hash and a 16 x 16 grey thumbnail."""
-    data = path.read_bytes()
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        link = f"links to {path.readlink()}, which is not there" if path.is_symlink() else error.strerror
+        faults.append(("image-unreadable", f"{where} ({link})"))
+        return None, b"", 0, b""
     digest = hashlib.blake2b(data, digest_size=12).digest()
     try:
         with Image.open(io.BytesIO(data)) as image:
