@@ -6,6 +6,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -167,6 +168,22 @@ def test_what_is_left_out_is_not_mixed_in_either(dataset: DrivingDataset) -> Non
     weights[0] = weights[-1] = 0
     list(build_loader(dataset, transform, batch_size=2, weights=weights))
     assert mixed == set(dataset.names[1:-1])
+
+
+def test_the_highest_draw_mixes_in_the_last_sample(dataset: DrivingDataset) -> None:
+    class Highest(np.random.Generator):
+        def random(self, *args: Any, **more: Any) -> Any:
+            return np.nextafter(1, 0)
+
+    def transform(
+        sample: Sample, rng: np.random.Generator, draw: Callable[[np.random.Generator], Sample] | None = None
+    ) -> Sample:
+        assert draw is not None
+        return EvalTransform(CANVAS)(draw(Highest(rng.bit_generator)), rng)
+
+    weights = np.full(len(dataset), 0.1)  # whose sum depends on the order that they are added in
+    batch = next(iter(build_loader(dataset, transform, batch_size=1, weights=weights)))
+    assert batch.names == (dataset.names[-1],)
 
 
 def test_length_of_an_epoch(dataset: DrivingDataset) -> None:

@@ -85,7 +85,10 @@ class _Samples(torch.utils.data.Dataset[Sample | TriLiteNetError]):
         self._dataset = dataset
         self._transform = transform
         self._seed = seed
-        self._chance = None if weights is None else np.cumsum(weights) / weights.sum()
+        self._chance: NDArray[np.float64] | None = None
+        if weights is not None:
+            self._chance = np.cumsum(weights)
+            self._chance /= self._chance[-1]  # not by the sum, which is rounded otherwise
 
     def __getitem__(self, draw: _Draw) -> Sample | TriLiteNetError:
         """Return the sample, or why there is none: PyTorch would wrap what a worker raises into pages of text."""
