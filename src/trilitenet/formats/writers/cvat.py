@@ -31,7 +31,8 @@ _LINE = "lane line"
 class CvatWriter(Writer):
     """Writes ``cvat-images.xml`` for the still images and ``NAME.cvat-video.xml`` for each video.
 
-    CVAT lists a video by track, not by frame, so the shapes of one video are held until it ends: about 2 KB a frame.
+    CVAT lists a video by track, not by frame, so the shapes of one video are held until it ends: about 4 KB a frame,
+    and 300 bytes a box without a track.
 
     Args:
         output: The folder.
@@ -170,7 +171,7 @@ class _ImagesFile:
             handle.write("</annotations>\n")
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(slots=True)
 class _Track:
     """One ``<track>``: what is inside each shape, by frame."""
 

@@ -29,7 +29,7 @@ _METADATA: Final = {"schema_version": "1.0.0", "annotator": "trilitenet"}
 class OpenLabelWriter(Writer):
     """Writes ``NAME.openlabel.json`` for each picture and each video.
 
-    The list of objects is held until a video ends: about 200 bytes an object.
+    The list of objects is held until a video ends: about 400 bytes an object, of which each box without a track is one.
 
     Args:
         output: The folder.
