@@ -23,16 +23,19 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from trilitenet.data.contact_sheet import as_perception
+from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.synthetic import Scene, SceneTruth, SyntheticScenes
 from trilitenet.data.synthetic_drive import SyntheticDrive
 from trilitenet.inference.video import VideoWriter
+from trilitenet.processing.boxes import box_iou
 from trilitenet.processing.drawing import draw
 from trilitenet.road.camera import write_camera
 from trilitenet.road.drawing import draw_road
 from trilitenet.road.lanes import find_lines
 from trilitenet.road.monitor import RoadMonitor
 from trilitenet.road.tracking import Steady
-from trilitenet.structures import Boxes, Perception
+from trilitenet.structures import Perception
 
 
 def true_figures(truth: SceneTruth) -> dict[str, Any]:
@@ -49,19 +52,7 @@ def true_figures(truth: SceneTruth) -> dict[str, Any]:
 
 def true_perception(scene: Scene) -> Perception:
     """Return what a network without fault would see."""
-    sample = scene.sample
-    assert sample.boxes is not None
-    assert sample.drivable is not None
-    assert sample.lane is not None
-    count = len(sample.boxes)
-    return Perception(
-        sample.size,
-        boxes=Boxes(sample.boxes, np.full(count, 0.9, np.float32), np.zeros(count, np.int64)),
-        drivable=sample.drivable > 0,
-        lane=sample.lane > 0,
-        image=sample.image,
-        timestamp=scene.truth.timestamp,
-    )
+    return dataclasses.replace(as_perception(scene.sample, ("vehicle",)), timestamp=scene.truth.timestamp)
 
 
 class Errors:
@@ -148,19 +139,16 @@ def miss_feet(data: Path, model: str, stride: int) -> None:
 
     predictor = trilitenet.load(model)
     missed, heights = [], []
-    for path in sorted((data / "det_annotations" / "val").glob("*.json"))[::stride]:
-        objects = json.loads(path.read_text(encoding="utf-8"))["frames"][0]["objects"]
-        sure = [o["box2d"] for o in objects if "box2d" in o and not o["attributes"].get("crowd")]
-        labels = np.array([[box[key] for key in ("x1", "y1", "x2", "y2")] for box in sure], np.float64)
-        seen = predictor(data / "images" / "val" / f"{path.stem}.jpg")
-        assert isinstance(seen, Perception)
-        if seen.boxes is None or not len(seen.boxes) or not len(labels):
+    dataset = DrivingDataset(data, "val")
+    for number in range(0, len(dataset), stride):
+        labels = dataset[number].boxes
+        if labels is None or not len(labels):
             continue
-        low = np.maximum(labels[None, :, :2], seen.boxes.xyxy[:, None, :2])
-        high = np.minimum(labels[None, :, 2:], seen.boxes.xyxy[:, None, 2:])
-        shared = np.prod(np.maximum(high - low, 0), axis=2)
-        areas = [np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) for boxes in (seen.boxes.xyxy, labels)]
-        overlap = shared / (areas[0][:, None] + areas[1][None] - shared)
+        seen = predictor(dataset.image_path(number))
+        assert isinstance(seen, Perception)
+        if seen.boxes is None or not len(seen.boxes):
+            continue
+        overlap = box_iou(seen.boxes.xyxy, labels)
         for index, best in enumerate(overlap.argmax(axis=1)):
             feet = float(seen.boxes.xyxy[index, 3]), float(labels[best, 3])
             if overlap[index, best] > 0.5 and max(feet) < seen.size[0] - 3:

@@ -13,23 +13,11 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from trilitenet.data.sample import Sample
+from trilitenet.data.contact_sheet import as_perception
 from trilitenet.data.synthetic import SyntheticScenes
 from trilitenet.processing.drawing import draw
-from trilitenet.structures import Boxes, Perception
 
 COLUMNS, ROWS, TILE = 4, 6, (192, 320)
-
-
-def labelled(sample: Sample) -> np.ndarray:
-    """Return the image with its labels drawn on it."""
-    assert sample.boxes is not None
-    assert sample.drivable is not None
-    assert sample.lane is not None
-    count = len(sample.boxes)
-    boxes = Boxes(sample.boxes, np.ones(count, np.float32), np.zeros(count, np.int64))
-    perception = Perception(sample.size, boxes=boxes, drivable=sample.drivable > 0, lane=sample.lane > 0)
-    return draw(perception, sample.image, hide=["labels"])
 
 
 def main() -> None:
@@ -44,7 +32,7 @@ def main() -> None:
     for row in range(ROWS):
         for column in range(COLUMNS):
             sample = scenes[row // 2 * COLUMNS + column]
-            picture = labelled(sample) if row % 2 else sample.image
+            picture = draw(as_perception(sample, ("vehicle",)), hide=["labels"]) if row % 2 else sample.image
             tiles.append(cv2.resize(picture, TILE[::-1], interpolation=cv2.INTER_AREA))
     sheet = np.vstack([np.hstack(tiles[i : i + COLUMNS]) for i in range(0, len(tiles), COLUMNS)])
     Image.fromarray(sheet).save(options.output, quality=82, optimize=True)
