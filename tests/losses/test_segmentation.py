@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from trilitenet.errors import ShapeError
-from trilitenet.losses.segmentation import IGNORED, SegmentationLoss, focal_loss, tversky_loss
+from trilitenet.losses.segmentation import IGNORED, SegmentationLoss
 
 
 def slow_focal(logits: Tensor, target: Tensor, alpha: float = 0.25, gamma: float = 2.0) -> float:
@@ -77,8 +77,9 @@ def test_by_hand() -> None:
     logits = torch.zeros(1, 2, 1, 2)
     target = torch.tensor([[[0, 1]]], dtype=torch.uint8)
     # Every probability is 1/2: each pixel has one true and one false channel.
-    assert float(focal_loss(logits, target)) == pytest.approx((0.25 + 0.75) * 0.25 * math.log(2))
-    assert float(tversky_loss(logits, target)) == pytest.approx((1 - 0.5 / (0.5 + 0.7 * 0.5 + 0.3 * 0.5)) ** (4 / 3))
+    terms = SegmentationLoss(0.7, 0.3)(logits, target)
+    assert float(terms.focal) == pytest.approx((0.25 + 0.75) * 0.25 * math.log(2))
+    assert float(terms.tversky) == pytest.approx((1 - 0.5 / (0.5 + 0.7 * 0.5 + 0.3 * 0.5)) ** (4 / 3))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -112,10 +113,9 @@ def test_computes_in_32_bits_under_autocast() -> None:
 
 
 def test_refuses_wrong_shapes() -> None:
-    with pytest.raises(ShapeError, match="logits must be"):
-        focal_loss(torch.zeros(1, 3, 4, 4), torch.zeros(1, 4, 4, dtype=torch.uint8))
-    with pytest.raises(ShapeError, match="logits must be"):
-        tversky_loss(torch.zeros(1, 2, 4, 4), torch.zeros(1, 4, 5, dtype=torch.uint8))
+    for channels, width in ((3, 4), (2, 5)):
+        with pytest.raises(ShapeError, match="logits must be"):
+            SegmentationLoss(0.7, 0.3)(torch.zeros(1, channels, 4, 4), torch.zeros(1, 4, width, dtype=torch.uint8))
 
 
 def test_any_memory_format_will_do() -> None:

@@ -105,7 +105,7 @@ def pick(dataset: DrivingDataset, where: Mapping[str, str], count: int, *, seed:
     """
     found: list[int] = []
     for index in np.random.default_rng(seed).permutation(len(dataset)).tolist():
-        if where and any(dataset.attributes(index).get(key) != value for key, value in where.items()):
+        if where and not where.items() <= dataset.attributes(index).items():
             continue
         found.append(index)
         if len(found) >= start + count:

@@ -183,7 +183,7 @@ def convert(
     state = _open_state(root, options, source.origin)
     names = {split: source.names(split) for split in chosen}
     if splits is None:
-        names |= {split: [] for split in _read_journals(state, ()) if split not in names}
+        names |= {path.stem: [] for path in sorted(state.glob("*.jsonl")) if path.stem not in names}
     total = sum(map(len, names.values()))
     finished = 0
     if progress:

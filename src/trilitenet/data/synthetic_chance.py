@@ -298,7 +298,6 @@ def random_vehicle(
     *,
     heavy: float = 0.18,
     number: int = 0,
-    speed: float = 0.0,
 ) -> Vehicle:
     """Draw a vehicle's kind and colour.
 
@@ -309,7 +308,6 @@ def random_vehicle(
         yaw: Radians it points to the left of the road.
         heavy: Share of trucks, buses and vans.
         number: Its identity.
-        speed: m/s along the road.
     """
     if rng.random() < heavy:
         kind = str(rng.choice(["van", "truck", "bus", "lorry"], p=[0.4, 0.3, 0.12, 0.18]))
@@ -319,7 +317,7 @@ def random_vehicle(
     red, green, blue = np.clip(base + rng.normal(0, 5, 3), 8, 245)
     return Vehicle(
         kind, s, d, yaw, (float(red), float(green), float(blue)), float(rng.uniform(0.93, 1.07)),
-        bool(rng.random() < 0.25), number, speed,
+        bool(rng.random() < 0.25), number,
     )  # fmt: skip
 
 

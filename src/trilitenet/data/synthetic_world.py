@@ -18,7 +18,6 @@ from trilitenet.processing.geometry import Camera
 
 __all__ = [
     "FAR",
-    "REAR_OVERHANG",
     "Barrier",
     "Course",
     "Item",
@@ -35,8 +34,6 @@ SceneKind = Literal["motorway", "country", "city", "residential", "one-way"]
 
 FAR: Final = 260.0
 """Metres ahead that the road is drawn to."""
-REAR_OVERHANG: Final = 0.8
-"""Metres from a car's rear bumper to where its rear tyres touch the road."""
 
 
 class Course:

@@ -14,7 +14,7 @@ from torch.nn import functional as F  # noqa: N812
 
 from trilitenet.errors import ShapeError
 
-__all__ = ["IGNORED", "SegmentationLoss", "SegmentationTerms", "focal_loss", "tversky_loss"]
+__all__ = ["IGNORED", "SegmentationLoss", "SegmentationTerms"]
 
 IGNORED: Final = 255
 """Value of a mask's pixels that count for nothing."""
@@ -30,54 +30,23 @@ class SegmentationTerms(NamedTuple):
     tversky: Tensor
 
 
-def focal_loss(logits: Tensor, target: Tensor, alpha: float = 0.25, gamma: float = 2.0) -> Tensor:
-    """Return the focal loss (Lin et al., 2017): binary, with logits, for each of the two channels, summed.
-
-    FL = -alpha_t (1 - p_t)^gamma log p_t, averaged over the pixels that count; alpha_t is ``alpha`` where the channel
-    is the truth and 1 - ``alpha`` elsewhere.
-
-    Args:
-        logits: (B, 2, H, W): background, foreground.
-        target: (B, H, W) uint8 of 0, 1 and 255.
-        alpha: Weight of the truth, in [0, 1].
-        gamma: How much easy pixels count less.
-
-    Raises:
-        ShapeError: If the shapes do not fit.
-    """
-    terms: SegmentationTerms = SegmentationLoss(0.5, 0.5, focal_alpha=alpha, focal_gamma=gamma)(logits, target)
-    return terms.focal
-
-
-def tversky_loss(logits: Tensor, target: Tensor, alpha: float = 0.7, beta: float = 0.3, gamma: float = 4 / 3) -> Tensor:
-    """Return the focal Tversky loss (Salehi et al., 2017): the whole batch is one region.
-
-    With the soft-max over the channels, T = TP / (TP + alpha FP + beta FN) for each class; the mean over both classes
-    of 1 - T (0 for a class without a pixel) is raised to ``gamma``.
-
-    Args:
-        logits: (B, 2, H, W): background, foreground.
-        target: (B, H, W) uint8 of 0, 1 and 255.
-        alpha: Weight of false positives.
-        beta: Weight of false negatives.
-        gamma: Exponent of the mean, at least 1.
-
-    Raises:
-        ShapeError: If the shapes do not fit.
-    """
-    terms: SegmentationTerms = SegmentationLoss(alpha, beta, tversky_gamma=gamma)(logits, target)
-    return terms.tversky
-
-
 class SegmentationLoss(nn.Module):
     """L = focal + Tversky of one mask.
+
+    The focal loss (Lin et al., 2017) is binary, with logits, for each of the two channels, summed: FL = -alpha_t
+    (1 - p_t)^gamma log p_t, averaged over the pixels that count; alpha_t is ``focal_alpha`` where the channel is the
+    truth and 1 - ``focal_alpha`` elsewhere.
+
+    The focal Tversky loss (Salehi et al., 2017) takes the whole batch as one region. With the soft-max over the
+    channels, T = TP / (TP + alpha FP + beta FN) for each class; the mean over both classes of 1 - T (0 for a class
+    without a pixel) is raised to ``tversky_gamma``.
 
     Args:
         alpha: Tversky's weight of false positives (0.7 for the drivable area, 0.9 for lanes).
         beta: Tversky's weight of false negatives (0.3, 0.1).
-        focal_alpha: See `focal_loss`.
-        focal_gamma: See `focal_loss`.
-        tversky_gamma: See `tversky_loss`.
+        focal_alpha: Weight of the truth, in [0, 1].
+        focal_gamma: How much easy pixels count less.
+        tversky_gamma: Exponent of the mean, at least 1.
     """
 
     def __init__(

@@ -338,31 +338,27 @@ class DetectionMetric:
         column = self._objects.array[:, number * len(AREAS) + area].astype(np.float64)
         return np.array([column.sum()]) if weights is None else np.asarray(weights, np.float64) @ column
 
-    def average_precision(
-        self, weights: NDArray[Any] | None = None, area: str = "all", levels: Sequence[int] | None = None
-    ) -> FloatArray:
+    def average_precision(self, weights: NDArray[Any] | None = None, area: str = "all") -> FloatArray:
         """Return AP by class and IoU threshold.
 
         Args:
             weights: (R, N) how often each image counts; None for once each (R = 1).
             area: A key of `AREAS`.
-            levels: Positions in `IOU_THRESHOLDS`; None for all.
 
         Returns:
-            (R, classes, levels) in [0, 1], NaN for a class without true boxes.
+            (R, classes, thresholds) in [0, 1], NaN for a class without true boxes.
         """
-        chosen = range(len(IOU_THRESHOLDS)) if levels is None else levels
         rounds = 1 if weights is None else len(weights)
-        out = np.full((rounds, len(self.class_names), len(chosen)), np.nan)
+        out = np.full((rounds, len(self.class_names), len(IOU_THRESHOLDS)), np.nan)
         column = list(AREAS).index(area)
         for number in range(len(self.class_names)):
             ranked = self._ranking(number, column)
             objects = self._objects_of(number, column, weights)
             for sums in ranked.sums(weights, len(self)):
-                for position, level in enumerate(chosen):
+                for level in range(len(IOU_THRESHOLDS)):
                     bit = np.uint16(1 << level)
                     hit, counted = (ranked.right & bit) != 0, (ranked.ignored & bit) == 0
-                    out[sums.rows, number, position] = _ap(sums, hit, counted, objects[sums.rows])
+                    out[sums.rows, number, level] = _ap(sums, hit, counted, objects[sums.rows])
         return out
 
     def _ranking(self, number: int, column: int) -> RankedBoxes:

@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 def usable_cores() -> int:
-    """Return on how many processor cores this process may run, which a container or `taskset` may limit."""
+    """Return on how many processor cores this process may run: `taskset` or a container's set of them may limit it."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

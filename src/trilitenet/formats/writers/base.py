@@ -344,6 +344,6 @@ def polylines(road: Mapping[str, Any] | None) -> Iterator[tuple[int, list[list[f
         yield line["id"], [[round(x + 0.5, 2), round(y + 0.5, 2)] for x, y in line["points"]]
 
 
-def rounded(values: Any, digits: int = 2) -> Iterator[float]:
-    """Yield plain floats, rounded: pixels to a hundredth by default."""
-    return (round(float(value), digits) for value in values)
+def rounded(pixels: Any) -> Iterator[float]:
+    """Yield plain floats, rounded to a hundredth."""
+    return (round(float(value), 2) for value in pixels)
