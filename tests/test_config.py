@@ -32,6 +32,11 @@ def test_what_a_dataclass_refuses_is_told_in_its_own_words() -> None:
     assert str(caught.value) == "here: thresholds: iou must be between 0 and 1, got 2.0"
 
 
+def test_an_unknown_key_of_a_part_is_told_with_the_nearest_of_its_own() -> None:
+    with pytest.raises(ConfigError, match=r"^here: unknown key 'thresholds.iuo'; did you mean 'iou'\?$"):
+        parse(Settings, {"thresholds": {"iuo": 0.5}}, "here")
+
+
 def test_a_value_of_the_wrong_type_is_told_with_its_field() -> None:
     with pytest.raises(ConfigError, match=r"^here: rate: .*number.*, got 'fast'$"):
         parse(Settings, {"rate": "fast"}, "here")

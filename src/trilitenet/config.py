@@ -11,7 +11,7 @@ import json
 import math
 from collections.abc import Hashable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from typing import Any, Final, Literal, TypeVar, get_args, get_type_hints
 
 import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -478,7 +478,8 @@ def _explain(cls: type[Any], error: ValidationError) -> str:
     if first["type"] in {"unexpected_keyword_argument", "extra_forbidden"}:
         owner: Any = cls
         for part in first["loc"][:-1]:
-            owner = next((f.default for f in dataclasses.fields(owner) if f.name == part), owner)
+            kind = get_type_hints(owner).get(str(part))
+            owner = next((one for one in (kind, *get_args(kind)) if dataclasses.is_dataclass(one)), owner)
         names = [field.name for field in dataclasses.fields(owner)]
         return f"unknown key {path!r}{did_you_mean(str(first['loc'][-1]), names)}"
     if first["type"] in {"missing", "missing_argument"}:
