@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import stat
 import time
@@ -83,3 +84,9 @@ def test_a_hundred_thousand_things_of_one_name_are_named_at_once() -> None:
     names = [free.give("frame") for _ in range(100_000)]
     assert time.process_time() - began < 2  # half an hour, were each name looked for from 2 on
     assert names[-1] == "frame-100000"
+
+
+def test_text_with_the_name_of_a_file_that_is_no_text_is_written(tmp_path: Path) -> None:
+    name = os.fsdecode(b"a\xff")
+    write_file(tmp_path / "report.json", json.dumps({"file": name}, ensure_ascii=False))
+    assert json.loads((tmp_path / "report.json").read_text(encoding="utf-8")) == {"file": name}

@@ -213,10 +213,12 @@ def replacing(path: Path) -> Iterator[Path]:
 def write_file(path: Path, content: str | bytes) -> None:
     """Write a file whole or not at all, in a folder made for it; a device or a link, such as /dev/stdout, stays so.
 
+    Text is written in UTF-8, with escapes for what has no place in that, such as bytes of a file's name.
+
     Raises:
         OutputError: If it cannot be written.
     """
-    data = content.encode() if isinstance(content, str) else content
+    data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_symlink() or (path.exists() and not path.is_file()):
