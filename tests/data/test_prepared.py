@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -341,6 +342,17 @@ def test_an_own_car_mask_elsewhere(root: Path, tmp_path: Path) -> None:
     assert isinstance(open_dataset(root, "train", canvas=CANVAS), PreparedDataset)
     os.utime(elsewhere, ns=(1, 1))
     assert isinstance(open_dataset(root, "train", canvas=CANVAS), DrivingDataset)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are text elsewhere")
+def test_names_that_are_no_text_are_prepared(root: Path, tmp_path: Path) -> None:
+    name = os.fsdecode(b"\xff")
+    for folder, ending in (("images", "jpg"), ("det_annotations", "json")):
+        (root / folder / "val" / f"val_0000.{ending}").rename(root / folder / "val" / f"{name}.{ending}")
+    prepare(root, canvas=CANVAS, splits=["val"])
+    packed = open_dataset(root, "val", canvas=CANVAS)
+    assert isinstance(packed, PreparedDataset)
+    assert packed[-1].name == DrivingDataset(root, "val")[2].name == name
 
 
 def test_a_full_disk_is_told(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
