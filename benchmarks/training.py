@@ -107,6 +107,7 @@ def measure(variant: str, options: argparse.Namespace) -> dict[str, list[tuple[f
         pipes[way], far = context.Pipe()
         processes.append(context.Process(target=serve, args=(far, variant, way, options)))
         processes[-1].start()
+        far.close()  # so that a process that fails is heard of
     times: dict[str, list[tuple[float, float]]] = {way: [] for way in WAYS}
     for round_number in range(options.rounds + 2):
         for way, pipe in pipes.items():
