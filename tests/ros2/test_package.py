@@ -103,7 +103,8 @@ def test_boxes_become_detections(messages: Any, types: Any, header: Any) -> None
     assert (first.results[0].hypothesis.class_id, first.results[0].hypothesis.score) == ("bus", 0.75)
     assert (first.id, second.id) == ("7", "")
     assert filled.header is first.header is header
-    assert messages.fill_detections(Perception((9, 9)), header, types).detections == []
+    nothing = Perception((9, 9), boxes=Boxes.empty())
+    assert messages.fill_detections(nothing, header, types).detections == []
 
 
 def test_masks_become_mono8(messages: Any, types: Any, header: Any) -> None:
@@ -161,6 +162,15 @@ def test_the_node_publishes_what_is_seen(node_module: Any, monkeypatch: pytest.M
     message.encoding, message.height = "bgr8", 0
     node.subscriptions["image"](message)
     assert "(0, 160, 3)" in node.messages[-1]
+
+
+def test_a_model_without_detection_publishes_no_detections(node_module: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    backend = _Backend()
+    monkeypatch.setattr(backend, "run", lambda batch: RawOutputs(None, *(np.zeros(batch.shape[:3], np.uint8),) * 2))
+    monkeypatch.setattr("trilitenet.load", lambda model, **options: Predictor(backend), raising=False)
+    node = node_module.PerceptionNode()
+    node.subscriptions["image"](_image("bgr8", np.zeros((96, 160, 3), np.uint8)))
+    assert [len(node.publishers[topic].published) for topic in ("~/detections", "~/drivable")] == [0, 1]
 
 
 def test_a_camera_file_of_another_shape_is_told_and_the_rest_published(

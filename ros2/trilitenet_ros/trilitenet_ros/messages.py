@@ -64,13 +64,13 @@ def fill_detections(perception: Any, header: Any, types: Types) -> Any:
     """Return a ``vision_msgs/Detection2DArray`` of the boxes, in pixels.
 
     Args:
-        perception: A `trilitenet.Perception`.
+        perception: A `trilitenet.Perception` with boxes.
         header: Of the image they were seen in.
         types: The message classes.
     """
     detections = []
     boxes = perception.boxes
-    for index in range(0 if boxes is None else len(boxes)):
+    for index in range(len(boxes)):
         left, top, right, bottom = (float(value) for value in boxes.xyxy[index])
         detection = types.Detection2D()
         detection.header = header

@@ -1,8 +1,9 @@
 """The node: subscribes to a camera, publishes what is seen. All logic is in `trilitenet_ros.messages`.
 
-Subscribes to ``image`` (sensor_msgs/Image). Publishes ``~/detections`` (vision_msgs/Detection2DArray), ``~/drivable``
-and ``~/lane_markings`` (sensor_msgs/Image, mono8), ``~/lane_left`` and ``~/lane_right`` (nav_msgs/Path in the vehicle's
-frame, once the camera is known). Advisory only: no safety function may rest on it.
+Subscribes to ``image`` (sensor_msgs/Image). Publishes, of the tasks that the model has, ``~/detections``
+(vision_msgs/Detection2DArray), ``~/drivable`` and ``~/lane_markings`` (sensor_msgs/Image, mono8), ``~/lane_left`` and
+``~/lane_right`` (nav_msgs/Path in the vehicle's frame, once the camera is known). Advisory only: no safety function may
+rest on it.
 """
 
 from __future__ import annotations
@@ -75,7 +76,8 @@ class PerceptionNode(Node):
         self._start = seconds if self._start is None else self._start
         perception = dataclasses.replace(self._predictor(pixels), frame=self._frame, timestamp=seconds - self._start)
         self._frame += 1
-        self._detections.publish(fill_detections(perception, message.header, TYPES))
+        if perception.boxes is not None:  # no detections would mean that nothing is there
+            self._detections.publish(fill_detections(perception, message.header, TYPES))
         if self._publish_masks:
             for name, mask in (("drivable", perception.drivable), ("lane_markings", perception.lane)):
                 if mask is not None:
