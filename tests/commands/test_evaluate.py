@@ -177,6 +177,32 @@ def test_negative_counts_are_refused_before_the_work(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"resolution": (96, 0)}, "at least 1, got 0"),
+        ({"resolution": (99999,)}, "at most 16384, got 99999"),
+        ({"corruptions": True, "severities": (3, 6)}, "--severities must be of 1 to 5, got 3, 6"),
+        ({"corruptions": True, "severities": ()}, "--severities must be of 1 to 5, got none"),
+        ({"batch_size": 0}, "--batch-size must be at least 1, got 0"),
+    ],
+)
+def test_what_comes_after_the_first_pass_is_refused_before_it(
+    settings: dict[str, Any], message: str, data: Path, weights: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        evaluate(str(weights), data=data, save=tmp_path / "saved", **settings)
+    assert not (tmp_path / "saved").exists()
+
+
+def test_other_sizes_of_a_fixed_input_are_refused_before_the_work(
+    artefacts: Artefacts, data: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match="--resolution needs one that takes any size"):
+        evaluate(str(artefacts.folder / "model.onnx"), data=data, save=tmp_path / "saved", resolution=(96,))
+    assert not (tmp_path / "saved").exists()
+
+
 def test_scoring_and_comparing_load_no_torch() -> None:
     code = "import sys, trilitenet.commands.score, trilitenet.commands.compare; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -90,10 +90,13 @@ def evaluate(
         The report.
 
     Raises:
-        ConfigError: If a count is negative, or an artefact has decided already what a protocol decides.
+        ConfigError: If a count, a severity or a size is out of range, or an artefact has decided already what a
+            protocol decides.
         OutputError: If there is a report already.
     """
-    check_counts(resamples, worst, limit, paper_batch)
+    check_counts(resamples, worst, limit, paper_batch, batch_size)
+    if not severities or not set(severities) <= set(SEVERITIES):
+        raise ConfigError(f"--severities must be of 1 to 5, got {', '.join(map(str, severities)) or 'none'}")
     check_output(output, overwrite)
     predictor = load(
         model,
@@ -107,6 +110,7 @@ def evaluate(
     )
     with predictor, ExitStack() as stack:
         _check_artefact(model, predictor, protocol)
+        resized = _resized(predictor, resolution)
         dataset = DrivingDataset(data, split, class_names=predictor.card.class_names)
         if "detection" in predictor.card.tasks:
             warn_of_foreign(dataset)
@@ -146,9 +150,9 @@ def evaluate(
             variations += corrupted_figures(
                 predictor, dataset, report, severities=severities, on_pass=shown.name, **settings
             )
-        if resolution:
+        if resized:
             shown.name("input sizes")
-            variations += figures_by_size(_resized(predictor, resolution), dataset, **settings)
+            variations += figures_by_size(resized, dataset, **settings)
         report = dataclasses.replace(report, variations=tuple(variations))
     write_report(report, output)
     return report
@@ -189,7 +193,12 @@ def warn_of_foreign(dataset: DrivingDataset) -> None:
 
 
 def _resized(predictor: Predictor, sides: Sequence[int]) -> dict[int, EvaluatedPredictor]:
-    if predictor.backend.canvas is not None:
+    """Return a predictor for each longer side of the input.
+
+    Raises:
+        ConfigError: If the input's size is fixed, or a side out of range.
+    """
+    if sides and predictor.backend.canvas is not None:
         height, width = predictor.backend.canvas
         raise ConfigError(
             f"this model's input is fixed to {width}x{height}; --resolution needs one that takes any size"
@@ -251,8 +260,10 @@ def known_report(folder: Path, model: str, data_hash: Callable[[], dict[str, str
     return report if same else None
 
 
-def check_counts(resamples: int, worst: int = 0, limit: int | None = None, paper_batch: int = 1) -> None:
-    """Refuse, before hours of work, counts that are negative, and a limit of no images.
+def check_counts(
+    resamples: int, worst: int = 0, limit: int | None = None, paper_batch: int = 1, batch_size: int = 1
+) -> None:
+    """Refuse, before hours of work, counts that are negative, and batches and a limit of no images.
 
     Raises:
         ConfigError: If one is.
@@ -260,8 +271,9 @@ def check_counts(resamples: int, worst: int = 0, limit: int | None = None, paper
     for option, value in (("resamples", resamples), ("worst", worst)):
         if value < 0:
             raise ConfigError(f"--{option} must not be negative, got {value}; 0 is for none")
-    if paper_batch < 1:
-        raise ConfigError(f"--paper-batch must be at least 1, got {paper_batch}")
+    for option, value in (("paper-batch", paper_batch), ("batch-size", batch_size)):
+        if value < 1:
+            raise ConfigError(f"--{option} must be at least 1, got {value}")
     if limit is not None and limit < 1:
         raise ConfigError(f"--limit must be at least 1, got {limit}; leave it out for all images")
 
