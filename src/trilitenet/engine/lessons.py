@@ -28,13 +28,13 @@ __all__ = ["Lessons", "TaughtTransform"]
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _HALF: Final = 127
+"""An area-resized mask pixel (0 to 255) above this is foreground, which keeps a mask's area."""
 _FIELDS: Final[dict[Task, tuple[str, ...]]] = {
     "detection": ("boxes", "class_id"),
     "drivable": ("drivable",),
     "lane": ("lane",),
 }
 """What a sample holds of a task."""
-"""An area-resized mask pixel (0 to 255) above this is foreground, which keeps a mask's area."""
 
 
 class Lessons:
@@ -76,7 +76,7 @@ class Lessons:
     def names(self) -> set[str]:
         """Return the images that the teacher said something of."""
         masks = (path.stem for task in ("drivable", "lane") for path in (self._saved.folder / task).glob("*.png"))
-        return self._saved.names | set(masks)
+        return set(self._saved.names).union(masks)
 
     def of(self, sample: Sample, wanted: Sequence[Task] = TASKS) -> Sample | None:
         """Return the sample with the teacher's outputs as its only labels; None if the teacher never saw it.

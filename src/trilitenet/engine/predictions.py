@@ -18,7 +18,7 @@ import json
 import math
 import re
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Final
@@ -153,9 +153,9 @@ class SavedPredictions:
             self._boxes = self._read_detections(folder / DETECTIONS_FILE)
 
     @property
-    def names(self) -> set[str]:
+    def names(self) -> Set[str]:
         """Images that have boxes."""
-        return set(self._boxes)
+        return self._boxes.keys()
 
     def get(self, name: str, size: tuple[int, int], tasks: Sequence[Task] = TASKS) -> Perception:
         """Return the prediction for an image.
