@@ -106,6 +106,11 @@ def test_conditions_hold_their_own_images() -> None:
     assert report.conditions[1].figures == pytest.approx(values(alone))
 
 
+def test_an_attribute_that_is_named_twice_has_one_table() -> None:
+    report = evaluate(fake_predictor(Images()), Images(), resamples=0, by=("timeofday", "scene", "timeofday"))
+    assert [(row.value, row.images) for row in report.conditions] == [("daytime", 9), ("night", 3)]
+
+
 def test_the_worst_images_are_kept_with_a_picture() -> None:
     images = Images()
     report = evaluate(fake_predictor(images, drift=4), images, resamples=0, worst=3)

@@ -75,9 +75,9 @@ class Scorecard:
         self.paper = PaperMetrics(len(class_names), self.tasks, batch_size=paper_batch) if "paper" in chosen else None
         self._confidence = confidence
         self._keep = worst
-        self._by = tuple(by)
+        self._by = tuple(dict.fromkeys(by))
         self._names: list[str] = []
-        self._values: dict[str, list[str]] = {attribute: [] for attribute in by}
+        self._values: dict[str, list[str]] = {attribute: [] for attribute in self._by}
         self._worst: dict[Task, list[tuple[float, int, int, WorstFrame]]] = {task: [] for task in self.tasks}
         self._serial = itertools.count()
 
