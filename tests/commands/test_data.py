@@ -158,11 +158,13 @@ def test_check_says_what_is_wrong(published: Path, tmp_path: Path, capsys: pytes
     assert page.count("<svg") >= 3
     assert "data:image/jpeg;base64," in page
     assert "http://" not in page
-    (published / "images/train/train_0001.jpg").write_bytes(b"<broken>")
+    for path in published.glob("*/train/train_0001.*"):
+        path.rename(path.with_name(f"left[a]:car:{path.suffix}"))
+    (published / "images/train/left[a]:car:.jpg").write_bytes(b"<broken>")
     assert main(words) == 1
     shown = capsys.readouterr().out
     assert "image-unreadable" in shown
-    assert "images/train/train_0001.jpg" in shown
+    assert "images/train/left[a]:car:.jpg" in shown  # brackets and colons are no markup
     assert json.loads(document.read_text())["findings"][0]["kind"] == "image-unreadable"
     assert "image-unreadable" in html.read_text()
     with pytest.raises(DataError, match="looks like nothing known"):

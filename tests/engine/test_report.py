@@ -174,6 +174,13 @@ def test_published_rows_stand_beside_with_their_protocol(report: Report, tmp_pat
     assert "A-YOLOM (n)" in (tmp_path / "comparison.html").read_text()
 
 
+def test_brackets_and_colons_in_names_are_no_markup(report: Report) -> None:
+    names = ("tiny[int8].onnx", "a:car:b", "c[/d]")
+    shown = compare_reports(dict.fromkeys(names, report), published=True, resamples=0).summary()
+    assert all(name in shown.split("beside published")[0] for name in names)
+    assert "[1]" in shown
+
+
 def test_published_rows_are_those_of_the_paper() -> None:
     rows = {row.name: row for row in PUBLISHED_ROWS}
     base = rows["TriLiteNet base"]

@@ -514,5 +514,5 @@ def _workers(workers: int) -> int:
 
 def _rendered(table: Table) -> str:
     text = io.StringIO()
-    Console(file=text, width=140).print(table)
+    Console(file=text, width=140, markup=False, emoji=False).print(table)  # names may have brackets
     return text.getvalue().rstrip()

@@ -269,7 +269,7 @@ def _published_table(comparison: Comparison) -> list[Table | Text]:
         shown.add_row(name, *cells, f"here, {comparison.data[name]}", style="bold")
     protocols = list(dict.fromkeys(row.protocol for row in comparison.published))
     for row in comparison.published:
-        shown.add_row(row.name, *row.printed, f"[{protocols.index(row.protocol) + 1}]".replace("[", r"\["))
+        shown.add_row(row.name, *row.printed, f"[{protocols.index(row.protocol) + 1}]")
     notes = "\n".join(f"[{number}] {protocol}" for number, protocol in enumerate(protocols, 1))
     return [shown, Text(notes + "\n[1] and [2]: BDD100K validation split, 10,000 images")]
 

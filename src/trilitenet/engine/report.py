@@ -269,11 +269,11 @@ class Report:
 
 
 def render(parts: list[Any]) -> str:
-    """Render rich objects as text, coloured if standard output is a terminal."""
+    """Render rich objects as text, coloured if standard output is a terminal; brackets in names are no markup."""
     buffer = io.StringIO()
     terminal = sys.stdout.isatty()
     width = max(shutil.get_terminal_size((110, 40)).columns, 80)
-    console = Console(file=buffer, force_terminal=terminal, width=width, highlight=False)
+    console = Console(file=buffer, force_terminal=terminal, width=width, highlight=False, markup=False, emoji=False)
     for part in parts:
         console.print(part)
     return buffer.getvalue().rstrip()
