@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +19,7 @@ from trilitenet.config import CARD_KEY, ArtefactInfo, ModelCard
 from trilitenet.deploy.graph import DeployGraph
 from trilitenet.deploy.layouts import LAYOUTS
 from trilitenet.deploy.ncnn import NcnnModel, build_ncnn, save_ncnn
-from trilitenet.errors import BackendError, MissingExtraError
+from trilitenet.errors import BackendError, MissingExtraError, OutputError
 from trilitenet.models.trilitenet import TriLiteNet
 
 ncnn = pytest.importorskip("ncnn")
@@ -100,3 +103,13 @@ def test_pnnx_that_fails_or_is_missing(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setitem(sys.modules, "pnnx", None)
     with pytest.raises(MissingExtraError, match=r"trilitenet\[ncnn\]"):
         build(network)
+
+
+def test_no_room_for_temporary_files_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fill(path: Path, data: bytes) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    # PyTorch aborts the process where it cannot write: it never gets the file.
+    monkeypatch.setattr(Path, "write_bytes", fill)
+    with pytest.raises(OutputError, match=rf"^{tempfile.gettempdir()}: cannot be written \(No space left on device\)$"):
+        build(lively_network("tiny"))

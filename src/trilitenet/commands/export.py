@@ -165,7 +165,7 @@ def export(
     if nms and "detection" not in network.tasks:
         raise ConfigError(f"{model} has no detection task, so there are no boxes to suppress; leave --nms out")
     if format == "triton":
-        with tempfile.TemporaryDirectory() as folder:
+        with writing(tempfile.gettempdir()), tempfile.TemporaryDirectory() as folder:
             exported = export(
                 model,
                 format="onnx",
@@ -209,7 +209,10 @@ def export(
     )
     checks = _canvases(frames or calibration, parsed or network.card.input_size, 8)
     if format == "torch":
-        return _export_torch(network, graph, info, path, checks)
+        traceable = Traceable(graph, network.card, info)
+        with torch.no_grad():
+            program = torch.export.export(traceable, (traceable.image,), dynamic_shapes=traceable.dynamic)
+        return _keep(network, program, info, path, checks)
     if format == "ncnn":
         return _keep(network, build_ncnn(graph, network.card, info), info, path, checks)
     thresholds = network.card.thresholds if nms else None
@@ -365,6 +368,15 @@ def _write(built: Any, path: Path, network: TriLiteNet, info: ArtefactInfo) -> N
         save_openvino(built, path, network.card, info)
     elif info.format == "ncnn":
         save_ncnn(built, path, network.card, info)
+    elif info.format == "torch":
+        metadata = {CARD_KEY: network.card.to_json(), ARTEFACT_KEY: info.to_json()}
+        data = io.BytesIO()  # PyTorch aborts the process where it cannot write to a file
+        torch.export.save(built, data, extra_files=metadata)
+        path.write_bytes(data.getbuffer())
+    elif info.format == "tensorrt":  # pragma: no cover - needs a GPU and TensorRT
+        from trilitenet.inference.tensorrt_backend import pack_engine
+
+        path.write_bytes(pack_engine(built, network.card, info))
     else:
         save_onnx(built, path)
 
@@ -384,16 +396,16 @@ def _keep(
 @contextlib.contextmanager
 def _trial(path: Path) -> Iterator[Path]:
     """Yield a name beside the destination; what is written there is moved into place if nothing is raised."""
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
-            try:
-                with writing(path):
-                    yield Path(folder) / path.name
-            except OutputError as error:
-                raise OutputError(str(error).replace(folder, str(path.parent))) from error
-            for part in Path(folder).iterdir():
-                part.replace(path.parent / part.name)
+    folder = str(path.parent)
+    try:
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
+                yield Path(folder) / path.name
+                for part in Path(folder).iterdir():
+                    part.replace(path.parent / part.name)
+    except OutputError as error:
+        raise OutputError(str(error).replace(folder, str(path.parent))) from error
 
 
 def _open(path: Path, info: ArtefactInfo) -> Backend:
@@ -405,6 +417,14 @@ def _open(path: Path, info: ArtefactInfo) -> Backend:
         from trilitenet.inference.ncnn_backend import NcnnBackend
 
         return NcnnBackend(path)
+    if info.format == "torch":
+        from trilitenet.inference.exported_torch_backend import ExportedTorchBackend
+
+        return ExportedTorchBackend(path, "cpu")
+    if info.format == "tensorrt":  # pragma: no cover - needs a GPU and TensorRT
+        from trilitenet.inference.tensorrt_backend import TensorRTBackend
+
+        return TensorRTBackend(path)
     from trilitenet.inference.onnx_backend import OnnxBackend
 
     return OnnxBackend(path, "cpu")
@@ -513,10 +533,12 @@ def _export_int8(
     reason = ""
     for keep in KEEP_STEPS if budget else KEEP_STEPS[1:2]:
         candidate = quantize(built, inputs, keep)
-        with tempfile.TemporaryDirectory() as folder:
-            trial = Path(folder) / path.name
-            _write(candidate, trial, network, info)
-            drop = budget.measure(_open(trial, info)) if budget else 0.0
+        drop = 0.0
+        if budget:
+            with writing(tempfile.gettempdir()), tempfile.TemporaryDirectory() as folder:
+                trial = Path(folder) / path.name
+                _write(candidate, trial, network, info)
+                drop = budget.measure(_open(trial, info))
         if max_drop is None or drop <= max_drop:
             exported = _keep(network, candidate, info, path, checks)
             kept = f"in floating point: {', '.join(keep) or 'attention and depthwise convolutions only'}"
@@ -526,38 +548,12 @@ def _export_int8(
     raise BackendError(f"{path}: not written, INT8 costs too much even with most layers in floating point ({reason})")
 
 
-def _export_torch(
-    network: TriLiteNet, graph: DeployGraph, info: ArtefactInfo, path: Path, checks: Sequence[NDArray[np.uint8]]
-) -> Exported:
-    from trilitenet.inference.exported_torch_backend import ExportedTorchBackend
-
-    traceable = Traceable(graph, network.card, info)
-    with torch.no_grad():
-        program = torch.export.export(traceable, (traceable.image,), dynamic_shapes=traceable.dynamic)
-    with _trial(path) as trial:
-        metadata = {CARD_KEY: network.card.to_json(), ARTEFACT_KEY: info.to_json()}
-        data = io.BytesIO()  # PyTorch aborts the process where it cannot write to a file
-        torch.export.save(program, data, extra_files=metadata)
-        trial.write_bytes(data.getbuffer())
-        with contextlib.closing(ExportedTorchBackend(trial, "cpu")) as backend:
-            parity = _compare(network, backend, info, checks)
-        _require(parity, path)
-    return Exported(path, info, parity)
-
-
 def _export_tensorrt(
     network: TriLiteNet, proto: Any, info: ArtefactInfo, path: Path, checks: Sequence[NDArray[np.uint8]]
 ) -> Exported:
     """Build an engine where TensorRT is; else write the restricted ONNX graph and say how to build it."""
     if is_installed():  # pragma: no cover - needs a GPU and TensorRT
-        from trilitenet.inference.tensorrt_backend import TensorRTBackend, pack_engine
-
-        with _trial(path) as trial:
-            trial.write_bytes(pack_engine(build_engine(proto, info.precision), network.card, info))
-            with contextlib.closing(TensorRTBackend(trial)) as backend:
-                parity = _compare(network, backend, info, checks)
-            _require(parity, path)
-        return Exported(path, info, parity)
+        return _keep(network, build_engine(proto, info.precision), info, path, checks)
     onnx_path = _fallback(path)
     exported = _keep(network, proto, dataclasses.replace(info, format="onnx", precision="fp32"), onnx_path, checks)
     notes = (

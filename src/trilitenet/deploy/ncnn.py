@@ -7,6 +7,7 @@ Boxes are decoded inside. The ``.param`` holds nothing that plain NCNN does not 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import subprocess
 import tempfile
@@ -18,7 +19,7 @@ import torch
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, WEIGHTS_HASH_KEY, ArtefactInfo, ModelCard
 from trilitenet.deploy.graph import DeployGraph, Traceable
-from trilitenet.errors import BackendError, import_extra
+from trilitenet.errors import BackendError, import_extra, writing
 
 __all__ = ["NcnnModel", "build_ncnn", "save_ncnn"]
 
@@ -48,15 +49,18 @@ def build_ncnn(graph: DeployGraph, card: ModelCard, info: ArtefactInfo) -> NcnnM
     Raises:
         MissingExtraError: If pnnx is not installed.
         BackendError: If pnnx cannot convert the graph.
+        OutputError: If there is no room for temporary files.
     """
     assert info.size is not None
     pnnx = import_extra("pnnx", "ncnn")
     traceable = Traceable(graph, card, info)
-    with tempfile.TemporaryDirectory(prefix="trilitenet-ncnn-") as name:
+    with writing(tempfile.gettempdir()), tempfile.TemporaryDirectory(prefix="trilitenet-ncnn-") as name:
         folder = Path(name)
+        traced = io.BytesIO()  # PyTorch aborts the process where it cannot write to a file
         with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")  # a trace is what pnnx reads; PyTorch would rather it read something newer
-            torch.jit.trace(traceable, (traceable.image,), check_trace=False).save(str(folder / "graph.pt"))
+            torch.jit.save(torch.jit.trace(traceable, (traceable.image,), check_trace=False), traced)
+        (folder / "graph.pt").write_bytes(traced.getbuffer())
         command = [
             pnnx.EXEC_PATH,
             "graph.pt",

@@ -23,7 +23,7 @@ from typing import Any, Final
 
 from numpy.typing import NDArray
 
-from trilitenet.errors import ConfigError, import_extra
+from trilitenet.errors import ConfigError, import_extra, writing
 
 __all__ = ["KEEP_STEPS", "kept_nodes", "quantize_onnx", "quantize_openvino"]
 
@@ -96,6 +96,11 @@ def quantize_onnx(model: Any, images: Sequence[NDArray[Any]], keep: Sequence[str
 
     Returns:
         The quantised ``onnx.ModelProto``, with the metadata of the model.
+
+    Raises:
+        ConfigError: If there are no images.
+        MissingExtraError: If ONNX Runtime is not installed.
+        OutputError: If there is no room for temporary files.
     """
     _check(images)
     onnx = import_extra("onnx", "onnx")
@@ -115,7 +120,7 @@ def quantize_onnx(model: Any, images: Sequence[NDArray[Any]], keep: Sequence[str
         def get_next(self) -> Mapping[str, NDArray[Any]] | None:
             return next(self.rest, None)
 
-    with tempfile.TemporaryDirectory() as folder, _quiet():
+    with writing(tempfile.gettempdir()), tempfile.TemporaryDirectory() as folder, _quiet():
         source, prepared, target = (Path(folder) / name for name in ("a.onnx", "b.onnx", "c.onnx"))
         source.write_bytes(model.SerializeToString())
         shape_inference.quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
