@@ -1,9 +1,11 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from pathlib import Path
-from typing import Literal
+from types import SimpleNamespace
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -11,11 +13,36 @@ from numpy.typing import NDArray
 
 from tests.artefacts import Artefacts
 from tests.fakes import ColourBackend
+from trilitenet.commands import benchmark as command
 from trilitenet.commands.benchmark import benchmark
 from trilitenet.errors import ConfigError, OutputError
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.torch_backend import TorchBackend
 from trilitenet.structures import RawOutputs
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the size of files is not limited there")
+def test_a_plot_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None:
+    import resource
+
+    pytest.importorskip("matplotlib")
+    path = tmp_path / "a.png"
+    path.write_bytes(b"old")
+    predictor: Any = SimpleNamespace(backend=SimpleNamespace(name="a runtime"))
+    call: Any = SimpleNamespace(
+        milliseconds=[1.0, 2.0], batch=1, entry=SimpleNamespace(model="tiny", predictor=predictor)
+    )
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        with pytest.raises(OutputError, match=r"a\.png: cannot be written"):
+            command._plot([call], path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+    command._plot([call], path)
+    assert path.read_bytes().startswith(b"\x89PNG")
 
 
 def test_models_take_turns(artefacts: Artefacts, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import pytest
 
 from trilitenet.engine.loggers import CsvLogger
 from trilitenet.engine.results import write_results
+from trilitenet.errors import OutputError
 
 
 def test_page_shows_curves_facts_and_pictures(tmp_path: Path) -> None:
@@ -29,3 +30,10 @@ def test_page_shows_curves_facts_and_pictures(tmp_path: Path) -> None:
     for name in ("losses.png", "metrics.png", "learning-rate.png", "labels-0.jpg", "prediction-0.jpg"):
         assert name in text
         assert (page.parent / name).stat().st_size > 300
+
+
+def test_a_page_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    CsvLogger(tmp_path / "metrics.csv").close()
+    (tmp_path / "results").touch()
+    with pytest.raises(OutputError, match=r"results: cannot be written \(File exists\)"):
+        write_results(tmp_path / "results", tmp_path / "metrics.csv", title="", facts={})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import itertools
 import json
 import os
@@ -22,7 +23,7 @@ import trilitenet
 from trilitenet.commands.load import load
 from trilitenet.commands.paths import check_writable, text_paths
 from trilitenet.config import VARIANTS, check_size
-from trilitenet.errors import ConfigError, OutputError, import_extra, write_file
+from trilitenet.errors import ConfigError, import_extra, write_file
 from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.cores import usable_cores
 
@@ -372,11 +373,9 @@ def _plot(calls: Sequence[_Call], path: Path) -> None:
     axes.invert_yaxis()
     axes.set_xlabel("milliseconds a call (box: quartiles, whiskers: 1st and 99th percentile)")
     axes.set_xlim(left=0)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path)
-    except (OSError, ValueError) as error:
-        raise OutputError(f"{path}: cannot be written ({error})") from error
+    picture = io.BytesIO()
+    figure.savefig(picture, format=path.suffix[1:].lower())
+    write_file(path, picture.getvalue())
 
 
 def _or_dash(value: float | None) -> str:

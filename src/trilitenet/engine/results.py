@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import io
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -45,8 +46,8 @@ def write_results(
 
     Raises:
         MissingExtraError: Without Matplotlib.
+        OutputError: If a file cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     curves: dict[str, tuple[list[int], list[float]]] = {}
     for step, name, value in read_csv(metrics):
         steps, values = curves.setdefault(name, ([], []))
@@ -60,12 +61,15 @@ def write_results(
     figures = []
     for group, names in groups.items():
         if names:
-            _plot(folder / f"{group}.png", {name: curves[name] for name in names}, log=group == "losses")
+            plot = _plot({name: curves[name] for name in names}, log=group == "losses")
+            write_file(folder / f"{group}.png", plot)
             figures.append(f'<figure><img src="{group}.png" alt="{group} by step"></figure>')
     pairs = []
     for number, (name, labels, prediction) in enumerate(pictures):
         for what, image in (("labels", labels), ("prediction", prediction)):
-            Image.fromarray(image).save(folder / f"{what}-{number}.jpg", quality=85)
+            picture = io.BytesIO()
+            Image.fromarray(image).save(picture, "JPEG", quality=85)
+            write_file(folder / f"{what}-{number}.jpg", picture.getvalue())
         pairs.append(
             f'<figure><figcaption>{html.escape(name)}: labels, prediction</figcaption><div class="pair">'
             f'<img src="labels-{number}.jpg" alt="labels"><img src="prediction-{number}.jpg" alt="prediction">'
@@ -82,7 +86,8 @@ def write_results(
     return page
 
 
-def _plot(path: Path, curves: Mapping[str, tuple[list[int], list[float]]], *, log: bool) -> None:
+def _plot(curves: Mapping[str, tuple[list[int], list[float]]], *, log: bool) -> bytes:
+    """Return a PNG."""
     module: Any = import_extra("matplotlib.figure", "train")
     figure = module.Figure(figsize=(10, 5), layout="constrained")
     axes = figure.add_subplot()
@@ -95,4 +100,6 @@ def _plot(path: Path, curves: Mapping[str, tuple[list[int], list[float]]], *, lo
     axes.set_xlabel("step")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))  # beside the curves, over none of them
-    figure.savefig(path, dpi=100)
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=100)
+    return picture.getvalue()

@@ -253,8 +253,8 @@ class Trainer:
                     part.unlink()
                 if resume is None:
                     _forget(self.folder)
-            write_file(self.folder / "config.yaml", yaml.safe_dump(self.config.to_dict(), sort_keys=False))
-            self.loggers = build_loggers(self.step)
+                write_file(self.folder / "config.yaml", yaml.safe_dump(self.config.to_dict(), sort_keys=False))
+                self.loggers = build_loggers(self.step)
         try:
             finished = self._run()
         except DataError as error:
