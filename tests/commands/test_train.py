@@ -29,7 +29,7 @@ from trilitenet.data.prepared import prepare
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.synthetic_files import write_dataset
 from trilitenet.engine import train as engine
-from trilitenet.engine.checkpoint import read_checkpoint
+from trilitenet.engine.checkpoint import read_checkpoint, write_checkpoint
 from trilitenet.engine.loggers import CsvLogger, read_csv
 from trilitenet.engine.predictions import PredictionWriter
 from trilitenet.engine.recipe import read_recipe
@@ -258,6 +258,24 @@ def test_a_signal_saves_and_ends_cleanly(
     assert signal.getsignal(number) == before
     monkeypatch.setattr(CsvLogger, "log", plain)
     assert train(resume=True, **logged(scenes, tmp_path, max_steps=6, workers=workers)).finished
+
+
+def test_every_checkpoint_is_written_once_and_a_log_that_cannot_be_is_told(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = []
+
+    def write(path: Path, state: dict[str, Any]) -> None:
+        written.append(state["step"])
+        write_checkpoint(path, state)
+
+    monkeypatch.setattr(engine, "write_checkpoint", write)
+    assert train(**settings(scenes, tmp_path, max_steps=4)).finished
+    assert written[-1] == 4
+    assert len(set(written)) == len(written) > 1
+    (tmp_path / "metrics.csv").mkdir()
+    with pytest.raises(OutputError, match=r"metrics\.csv: cannot be written \(Is a directory\)"):
+        train(resume=True, **logged(scenes, tmp_path, max_steps=5))
 
 
 @pytest.mark.parametrize("last", [2, 4])

@@ -390,7 +390,10 @@ class Trainer:
         return terms
 
     def _end_epoch(self, epoch: int, stop: StopRequest) -> None:
-        """Validate, keep the best, save; not if a wish to stop comes meanwhile, for a run that goes on does it anew."""
+        """Validate, keep the best, save, but at the end of the run, which does that itself.
+
+        A validation is left if a wish to stop comes meanwhile; a run that goes on does it anew.
+        """
         last = self.step >= self.steps
         if self.validate is not None and (last or (epoch + 1) % self.config.validate_every == 0):
             whole = self.fabric.is_global_zero and self._validate(epoch, stop)
@@ -398,7 +401,7 @@ class Trainer:
             if not whole:
                 return
         self.ended = self.step
-        if last or (epoch + 1) % self.config.checkpoint_every == 0:
+        if not last and (epoch + 1) % self.config.checkpoint_every == 0:
             self.save()
 
     def _validate(self, epoch: int, stop: StopRequest) -> bool:
