@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import logging
 import os
 import re
 import time
@@ -16,13 +15,12 @@ from typing import Final
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
 from trilitenet.commands.load import load
 from trilitenet.commands.paths import text_paths
+from trilitenet.commands.progress import show_bars
 from trilitenet.errors import (
     LONGEST_NAME,
     BackendError,
@@ -453,7 +451,8 @@ class _Job:
                     self.writers.append(writer)
                     for source_name in self.names:  # the same names as the overlays, whichever source fails
                         writer.stem(Perception(size=(1, 1), source=source_name))
-            progress = stack.enter_context(_show_progress(quiet))
+            columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), _Speed())
+            progress = stack.enter_context(show_bars(*columns, TimeRemainingColumn(), quiet=quiet))
             if window is not None:
                 stack.enter_context(contextlib.closing(window))
             try:
@@ -602,34 +601,6 @@ class _Speed(ProgressColumn):
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
         return Text("" if speed is None else f"{speed:.1f}/s")
-
-
-@contextlib.contextmanager
-def _show_progress(quiet: bool) -> Iterator[Progress]:
-    """Show progress on the terminal, if there is one; messages of the log go above it."""
-    console = Console(stderr=True)
-    progress = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        _Speed(),
-        TimeRemainingColumn(),
-        console=console,
-        disable=quiet or not console.is_terminal,
-    )
-    if progress.disable:
-        yield progress
-        return
-    log = logging.getLogger("trilitenet")
-    handler = RichHandler(console=console, show_time=False, show_path=False)
-    log.addHandler(handler)
-    propagate, log.propagate = log.propagate, False
-    try:
-        with progress:
-            yield progress
-    finally:
-        log.removeHandler(handler)
-        log.propagate = propagate
 
 
 class _WindowClosed(Exception):  # noqa: N818 - a request, not an error

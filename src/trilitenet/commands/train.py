@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import inspect
 import json
@@ -17,7 +18,6 @@ import cyclopts
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -27,9 +27,11 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
 
 from trilitenet.commands.evaluate import warn_of_foreign
 from trilitenet.commands.paths import text_paths
+from trilitenet.commands.progress import show_bars
 from trilitenet.config import DEFAULT_ANCHORS, ModelCard, parse_yaml
 from trilitenet.data.contact_sheet import as_perception
 from trilitenet.data.identity import identify, parts_of
@@ -109,7 +111,7 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
     """Train as one of the processes of a run."""
     folder = Path(config.output)
     torch.manual_seed(config.seed)
-    with _Display(quiet=not fabric.is_global_zero) as display:
+    with _display(quiet=not fabric.is_global_zero) as display:
         dataset = training_data(config)
         _check_labels(config, dataset)
         loader = build_loader(
@@ -363,58 +365,49 @@ def _pictures(
 
 
 class _Display:
-    """A progress bar on a terminal, lines elsewhere; both on standard error."""
+    """A bar on a terminal, lines elsewhere; both on standard error."""
 
-    def __init__(self, *, quiet: bool) -> None:
-        self._quiet = quiet
-        self._bar: Progress | None = None
+    def __init__(self, progress: Progress, *, quiet: bool) -> None:
+        self._progress, self._quiet = progress, quiet
+        self._task = progress.add_task("", total=None, what="step")
         self._validation: TaskID | None = None
-        if not quiet and sys.stderr.isatty():
-            self._bar = Progress(
-                TextColumn("{task.fields[what]}"),
-                MofNCompleteColumn(),
-                BarColumn(),
-                TimeElapsedColumn(),
-                TimeRemainingColumn(),
-                TextColumn("{task.description}"),
-                console=Console(stderr=True),
-            )
-            self._task = self._bar.add_task("", total=None, what="step")
-
-    def __enter__(self) -> _Display:
-        if self._bar is not None:
-            self._bar.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
 
     def line(self, text: str) -> None:
         """Show a line that stays."""
-        if self._bar is not None:
-            self._bar.console.print(text, highlight=False, markup=False)
-        elif not self._quiet:
+        if not self._quiet:
             sys.stderr.write(text + "\n")
             sys.stderr.flush()
 
     def step(self, step: int, steps: int, text: str) -> None:
         """Show how far the run is."""
-        if self._bar is not None:
-            self._bar.update(self._task, completed=step, total=steps, description=text.partition(": ")[2])
-        else:
+        if self._progress.disable:
             self.line(text)
+        else:
+            self._progress.update(self._task, completed=step, total=steps, description=text.partition(": ")[2])
 
     def validation(self, images: int, count: int) -> None:
         """Show how many images the network has been measured on, and of how many."""
-        if self._bar is None:
-            return
         if self._validation is None:
-            self._validation = self._bar.add_task("", what="validation")
-        self._bar.update(self._validation, completed=images, total=count)
+            self._validation = self._progress.add_task("", what="validation")
+        self._progress.update(self._validation, completed=images, total=count)
         if images == count:
-            self._bar.remove_task(self._validation)
+            self._progress.remove_task(self._validation)
             self._validation = None
+
+
+@contextlib.contextmanager
+def _display(*, quiet: bool) -> Iterator[_Display]:
+    """Yield what shows a run; of the losses as much as the terminal has room for beside the rest."""
+    columns = (
+        TextColumn("{task.fields[what]}"),
+        MofNCompleteColumn(),
+        BarColumn(20),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    losses = TextColumn("{task.description}", table_column=Column(ratio=1, no_wrap=True))
+    with show_bars(*columns, losses, quiet=quiet, expand=True) as progress:
+        yield _Display(progress, quiet=quiet)
 
 
 def _flags(config: type[Any], prefix: str = "") -> list[inspect.Parameter]:
