@@ -255,19 +255,7 @@ def test_an_unfinished_video_has_no_final_name(tmp_path: Path) -> None:
     for _ in range(3):
         writer.write(coloured_scene(32, 32))
     assert not (tmp_path / "a.mp4").exists()
-    writer.abort()
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("frames", [0, 3])
-def test_giving_up_leaves_what_stood_there(tmp_path: Path, frames: int) -> None:
-    path = tmp_path / "a.mp4"
-    path.write_bytes(b"precious")
-    writer = VideoWriter(path)
-    for _ in range(frames):
-        writer.write(coloured_scene(32, 32))
-    writer.abort()
-    assert path.read_bytes() == b"precious"
+    writer.close()
     assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
 
 
@@ -277,7 +265,6 @@ def test_a_frame_after_the_end_is_refused(tmp_path: Path) -> None:
     writer.close()
     with pytest.raises(OutputError, match=r"a\.mp4: the video was closed"):
         writer.write(coloured_scene(32, 32))
-    writer.abort()
     writer.close()
     assert (tmp_path / "a.mp4").exists()
 

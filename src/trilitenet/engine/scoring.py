@@ -152,15 +152,12 @@ class FairMetrics(_ByTask):
         class_names: Detection classes.
         tasks: Tasks to score.
         confidence: The stated confidence for precision, recall and F1 of detection.
-        max_boxes: At most so many boxes an image and class.
     """
 
     name = "fair"
 
-    def __init__(
-        self, class_names: Sequence[str], tasks: Sequence[Task], *, confidence: float = 0.25, max_boxes: int = 300
-    ) -> None:
-        self.detection = DetectionMetric(class_names, confidence, max_boxes) if "detection" in tasks else None
+    def __init__(self, class_names: Sequence[str], tasks: Sequence[Task], *, confidence: float = 0.25) -> None:
+        self.detection = DetectionMetric(class_names, confidence) if "detection" in tasks else None
         self.drivable = SegmentationMetric() if "drivable" in tasks else None
         self.lane = LaneMetric() if "lane" in tasks else None
 

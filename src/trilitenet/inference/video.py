@@ -245,7 +245,7 @@ class VideoWriter:
         self._last = -1
         self._waiting: queue.Queue[tuple[NDArray[np.uint8], float] | None] = queue.Queue(ahead)
         self._error: OutputError | None = None
-        self._closed = self._aborted = False
+        self._closed = False
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -279,12 +279,6 @@ class VideoWriter:
         if self._error is not None:
             raise self._error
 
-    def abort(self) -> None:
-        """Forget the file: what was written goes, what stood under its name before, or was closed, stays."""
-        self._aborted = True
-        with contextlib.suppress(OutputError):
-            self.close()
-
     def __enter__(self) -> VideoWriter:
         return self
 
@@ -298,15 +292,11 @@ class VideoWriter:
         item: tuple[NDArray[np.uint8], float] | None = None
         try:
             while (item := self._waiting.get()) is not None:
-                if not self._aborted:
-                    self._encode(*item)
+                self._encode(*item)
             if self._container is not None:
                 self._mux(None)
                 self._container.close()
-                if self._aborted:
-                    self._partial.unlink()
-                else:
-                    self._partial.replace(self.path)
+                self._partial.replace(self.path)
         except Exception as error:  # whatever it is, the caller must hear of it and not wait
             reason = getattr(error, "strerror", None) or str(error)
             self._error = OutputError(f"{self.path}: the video cannot be written ({reason})")

@@ -114,7 +114,6 @@ class Batcher:
         max_batch: The most canvases at once.
         delay: Seconds that a batch that is not full waits for more.
         observe: Told the size of each batch that is through.
-        clock: Seconds that only grow; replaced in tests.
     """
 
     def __init__(
@@ -124,13 +123,11 @@ class Batcher:
         max_batch: int,
         delay: float = 0.0,
         observe: Callable[[int], None] = lambda size: None,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._run = run
         self._max_batch = max_batch
         self._delay = delay
         self._observe = observe
-        self._clock = clock
         self._waiting: deque[_Item] = deque()
         self._changed = threading.Condition()
         self._closing = False
@@ -155,7 +152,7 @@ class Batcher:
 
         Args:
             canvas: (H, W, 3) uint8 RGB, letterboxed.
-            deadline: On the clock; one that is not started by then fails with `BusyError`.
+            deadline: On `time.monotonic`; one that is not started by then fails with `BusyError`.
 
         Returns:
             Its raw outputs (a batch of one), the seconds it waited, and the seconds its batch took. Cancelling the
@@ -164,7 +161,7 @@ class Batcher:
         Raises:
             BusyError: If the service is closing.
         """
-        item = _Item(canvas, deadline, self._clock(), Future())
+        item = _Item(canvas, deadline, time.monotonic(), Future())
         with self._changed:
             if self._closing:
                 raise BusyError("closing", "the service is closing")
@@ -195,9 +192,9 @@ class Batcher:
                 self._changed.wait()
             if not self._waiting:
                 return None
-            until = self._clock() + self._delay
+            until = time.monotonic() + self._delay
             while len(self._waiting) < self._max_batch and not self._closing:
-                left = until - self._clock()
+                left = until - time.monotonic()
                 if left <= 0 or not self._changed.wait(left):
                     break
             return self._take()
@@ -206,7 +203,7 @@ class Batcher:
         """Take the oldest item and those of its shape; drop the cancelled and the late."""
         batch: list[_Item] = []
         others: deque[_Item] = deque()
-        now = self._clock()
+        now = time.monotonic()
         while self._waiting and len(batch) < self._max_batch:
             item = self._waiting.popleft()
             if batch and item.canvas.shape != batch[0].canvas.shape:
@@ -221,7 +218,7 @@ class Batcher:
         return batch
 
     def _run_batch(self, batch: list[_Item]) -> None:
-        start = self._clock()
+        start = time.monotonic()
         try:
             raw = self._run(np.stack([item.canvas for item in batch]))
             pieces = split(raw, len(batch))
@@ -230,7 +227,7 @@ class Batcher:
             for item in batch:
                 item.future.set_exception(error)
             return
-        seconds = self._clock() - start
+        seconds = time.monotonic() - start
         self._observe(len(batch))
         for item, piece in zip(batch, pieces, strict=True):
             item.future.set_result((piece, start - item.entered, seconds))
