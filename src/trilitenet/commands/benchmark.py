@@ -6,10 +6,10 @@ import dataclasses
 import io
 import itertools
 import json
+import math
 import os
 import platform
 import statistics
-import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -23,6 +23,7 @@ import trilitenet
 from trilitenet.commands.load import load
 from trilitenet.commands.paths import check_writable, text_paths
 from trilitenet.config import VARIANTS, check_size
+from trilitenet.engine.provenance import peak_memory
 from trilitenet.errors import ConfigError, import_extra, write_file
 from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.cores import usable_cores
@@ -204,7 +205,9 @@ def benchmark(
                 entry = _Entry(name, one, device, streams, threads)
                 stack.enter_context(entry.predictor)
                 calls += [_Call(entry, count, stage, size, source) for count in batch]
-            result = Benchmark(_measure(calls, rounds, warmup), (), machine, rounds, _peak_memory())
+            timings, memory = _measure(calls, rounds, warmup), peak_memory()
+            bytes_held = None if math.isnan(memory) else round(memory * 2**20)
+            result = Benchmark(timings, (), machine, rounds, bytes_held)
         if output is not None:
             write_file(output, json.dumps(result.to_dict(), indent=2) + "\n")
         if plot is not None and calls:
@@ -348,16 +351,6 @@ def _costs(size: tuple[int, int]) -> tuple[Cost, ...]:
         Cost(name, count_parameters(network), count_multiply_adds(network, size), size)
         for name, network in networks.items()
     )
-
-
-def _peak_memory() -> int | None:
-    """Return the largest resident size of the process in bytes."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
 
 
 def _plot(calls: Sequence[_Call], path: Path) -> None:

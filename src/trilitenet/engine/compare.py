@@ -19,7 +19,7 @@ from trilitenet.config import Task
 from trilitenet.engine.figures import HEADLINES, meaning
 from trilitenet.engine.page import escape, interval_plot, page, percent, section, table
 from trilitenet.engine.published_rows import PUBLISHED_ROWS, PublishedRow
-from trilitenet.engine.report import SAVED, Report, render
+from trilitenet.engine.report import SAVED, Report, render, without_nan
 from trilitenet.errors import ConfigError, write_file
 from trilitenet.metrics.bootstrap import bootstrap, interval
 
@@ -79,24 +79,18 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``json.dumps`` takes (NaN is null)."""
-
-        def known(value: float) -> float | None:
-            return None if math.isnan(value) else value
-
-        return {
+        mapping = {
             "schema": COMPARISON_SCHEMA,
             "names": list(self.names),
             "data": self.data,
-            "figures": {name: {key: known(value) for key, value in row.items()} for name, row in self.figures.items()},
-            "differences": [
-                {key: known(value) if isinstance(value, float) else value for key, value in vars(one).items()}
-                for one in self.differences
-            ],
+            "figures": self.figures,
+            "differences": [dataclasses.asdict(one) for one in self.differences],
             "unpaired": self.unpaired,
             "confidence": self.confidence,
             "published": [dataclasses.asdict(row) for row in self.published],
             "resamples": self.resamples,
         }
+        return dict(without_nan(mapping))
 
     def save(self, folder: Path) -> None:
         """Write comparison.json and comparison.html into a folder.

@@ -43,7 +43,6 @@ __all__ = [
     "LabelledImages",
     "best_thresholds",
     "evaluate",
-    "provenance_now",
     "score_predictions",
 ]
 
@@ -177,22 +176,13 @@ def evaluate(
                 scoring.submit(
                     _score_one, score, sample, raw, index, letterbox, predictor.thresholds, card, native, protocols
                 )
-    return scorecard.report(
-        lambda images: provenance_now(
-            images,
-            started,
-            {
-                "model": card.variant,
-                "runtime": predictor.backend.name,
-                "thresholds": dataclasses.asdict(predictor.thresholds),
-                "canvas": tuple(f"{width}x{height}" for height, width in canvases),
-                "settings": _settings(protocols, paper_batch, resamples, seed),
-                **(about or {}),
-            },
-        ),
-        resamples=resamples,
-        seed=seed,
-    )
+    details = {
+        "model": card.variant,
+        "runtime": predictor.backend.name,
+        "thresholds": dataclasses.asdict(predictor.thresholds),
+        **(about or {}),
+    }
+    return _report(scorecard, started, canvases, details, protocols, paper_batch, resamples, seed)
 
 
 def score_predictions(
@@ -264,22 +254,13 @@ def score_predictions(
             f"{predictions.folder}: predictions for none of the {count} images "
             f"(such as {min(predictions.names)!r}); image_id must be the name of the image without ending"
         )
-    return scorecard.report(
-        lambda images: provenance_now(
-            images,
-            started,
-            {
-                "model": str(predictions.folder),
-                "runtime": SAVED,
-                "thresholds": {"confidence": confidence},
-                "canvas": tuple(f"{width}x{height}" for height, width in canvases),
-                "settings": _settings(protocols, paper_batch, resamples, seed),
-                **(about or {}),
-            },
-        ),
-        resamples=resamples,
-        seed=seed,
-    )
+    details = {
+        "model": str(predictions.folder),
+        "runtime": SAVED,
+        "thresholds": {"confidence": confidence},
+        **(about or {}),
+    }
+    return _report(scorecard, started, canvases, details, protocols, paper_batch, resamples, seed)
 
 
 def _with_saved(sample: LabelledImage, predictions: SavedPredictions) -> tuple[LabelledImage, Perception]:
@@ -316,44 +297,57 @@ def _count(dataset: LabelledImages, limit: int | None) -> int:
     return len(dataset) if limit is None else min(limit, len(dataset))
 
 
-def _settings(protocols: Sequence[str], paper_batch: int, resamples: int, seed: int) -> dict[str, Any]:
+def _report(
+    scorecard: Scorecard,
+    started: float,
+    canvases: Iterable[tuple[int, int]],
+    about: Mapping[str, Any],
+    protocols: Sequence[str],
+    paper_batch: int,
+    resamples: int,
+    seed: int,
+) -> Report:
+    """Return the report of what was scored, with what is known of the run: versions, hardware, time and memory.
+
+    Args:
+        scorecard: Of all images.
+        started: `time.time` at the start.
+        canvases: (height, width) of the network's inputs.
+        about: Fields of `Provenance`.
+        protocols: Those that were used.
+        paper_batch: Images a batch of the published averages.
+        resamples: Bootstrap draws for the intervals.
+        seed: Of the draws.
+    """
     settings: dict[str, Any] = {
         "protocols": list(protocols),
         "lowest_confidence": LOWEST_CONFIDENCE,
         "resamples": resamples,
         "seed": seed,
     }
-    return settings | ({"paper_batch": paper_batch} if "paper" in protocols else {})
-
-
-def provenance_now(images: int, started: float, about: Mapping[str, Any]) -> Provenance:
-    """Complete what is known of a run with versions, hardware, time and memory.
-
-    Args:
-        images: How many images were scored.
-        started: `time.time` at the start.
-        about: Fields of `Provenance`.
-    """
+    if "paper" in protocols:
+        settings["paper_batch"] = paper_batch
     fields: dict[str, Any] = {
-        "model": "",
         "model_sha256": None,
-        "runtime": "",
         "data": "",
         "split": "",
         "data_sha256": {},
-        "thresholds": {},
-        "settings": {},
-        "canvas": (),
+        "settings": settings,
+        "canvas": tuple(f"{width}x{height}" for height, width in canvases),
         **about,
     }
-    return Provenance(
-        **fields,
-        images=images,
-        versions=dict(describe_versions()),
-        hardware=describe_hardware(),
-        started=datetime.datetime.fromtimestamp(started, datetime.timezone.utc).isoformat(timespec="seconds"),
-        seconds=round(time.time() - started, 3),
-        peak_memory_mib=round(peak_memory(), 1),
+    return scorecard.report(
+        lambda images: Provenance(
+            **fields,
+            images=images,
+            versions=dict(describe_versions()),
+            hardware=describe_hardware(),
+            started=datetime.datetime.fromtimestamp(started, datetime.timezone.utc).isoformat(timespec="seconds"),
+            seconds=round(time.time() - started, 3),
+            peak_memory_mib=round(peak_memory(), 1),
+        ),
+        resamples=resamples,
+        seed=seed,
     )
 
 
@@ -592,17 +586,18 @@ def _ahead(prepare: Callable[[_S], _T], order: Iterable[_S], depth: int, name: s
 class _InOrder:
     """Calls, one after the other in a thread of their own; a few may wait, and the first error is raised."""
 
-    def __init__(self, waiting: int = 8) -> None:
+    _WAITING: Final = 8
+
+    def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="scorer")
         self._futures: collections.deque[Future[None]] = collections.deque()
-        self._waiting = waiting
 
     def __enter__(self) -> _InOrder:
         return self
 
     def submit(self, function: Callable[..., None], *arguments: Any) -> None:
         self._futures.append(self._pool.submit(function, *arguments))
-        while len(self._futures) > self._waiting:
+        while len(self._futures) > self._WAITING:
             self._futures.popleft().result()
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:

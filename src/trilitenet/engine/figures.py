@@ -68,20 +68,6 @@ for _task in ("drivable", "lane"):
             f"{_title}, data set", f"{_formula}, one confusion matrix"
         )
 
-HEADLINES: Final = (
-    "fair/detection/ap50",
-    "fair/detection/f1",
-    "fair/drivable/miou",
-    "fair/lane/iou",
-    "fair/lane/f1_2px",
-    "paper/detection/recall",
-    "paper/detection/map50",
-    "paper/drivable/miou",
-    "paper/lane/acc",
-    "paper/lane/iou",
-)
-"""The few that stand first."""
-
 CONDITION_FIGURES: Final = {
     "fair": (
         "fair/detection/ap50",
@@ -99,6 +85,8 @@ CONDITION_FIGURES: Final = {
     ),
 }
 """Columns of the tables by condition; those of 'paper' are the paper's own."""
+HEADLINES: Final = (*CONDITION_FIGURES["fair"], *CONDITION_FIGURES["paper"])
+"""The few that stand first."""
 
 
 def meaning(key: str) -> FigureMeaning:

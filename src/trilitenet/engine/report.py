@@ -215,8 +215,7 @@ class Report:
 
     def metrics(self) -> dict[str, FairMetrics | PaperMetrics]:
         """Return the metrics by protocol, filled, to compute further figures from."""
-        readers: dict[str, Any] = {"fair": FairMetrics.from_state, "paper": PaperMetrics.from_state}
-        return {name: readers[name](state) for name, state in self.state.items()}
+        return _metrics(self.state)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``json.dumps`` takes: the documented JSON form (without pictures; NaN is null)."""
@@ -237,7 +236,7 @@ class Report:
             "images": list(self.names),
             "state": self.state,
         }
-        return dict(_without_nan(mapping))
+        return dict(without_nan(mapping))
 
     def save_json(self, path: Path) -> None:
         """Write the JSON form.
@@ -380,13 +379,12 @@ def read_report(path: Path) -> Report:
             raise DataError(f"{path}: report schema {schema!r} is newer than {REPORT_SCHEMA}; upgrade trilitenet")
         state = mapping["state"]
         provenance = Provenance(**{**mapping["provenance"], "canvas": tuple(mapping["provenance"]["canvas"])})
-        readers: dict[str, Any] = {"fair": FairMetrics.from_state, "paper": PaperMetrics.from_state}
-        metrics = {name: readers[name](part) for name, part in state.items()}
+        scores: dict[str, Any] = {name: metrics.compute() for name, metrics in _metrics(state).items()}
         plots = mapping["detection_plots"]
         return Report(
             provenance=provenance,
-            fair=metrics["fair"].compute() if "fair" in metrics else None,
-            paper=metrics["paper"].compute() if "paper" in metrics else None,
+            fair=scores.get("fair"),
+            paper=scores.get("paper"),
             figures={
                 key: Figure(_number(figure["value"]), figure["low"], figure["high"])
                 for key, figure in mapping["figures"].items()
@@ -426,6 +424,11 @@ def read_report(path: Path) -> Report:
         raise DataError(f"{path}: not a report that `trilitenet evaluate` wrote ({brief(error)})") from error
 
 
+def _metrics(state: Mapping[str, Any]) -> dict[str, FairMetrics | PaperMetrics]:
+    readers: dict[str, Any] = {"fair": FairMetrics.from_state, "paper": PaperMetrics.from_state}
+    return {name: readers[name](part) for name, part in state.items()}
+
+
 def _plots(mapping: Mapping[str, Any]) -> DetectionPlots:
     return DetectionPlots(
         **{name: tuple(_number(value) for value in mapping[name]) for name in ("recall", "precision", "confidence")},
@@ -440,14 +443,14 @@ def _number(value: float | None) -> float:
     return float("nan") if value is None else float(value)
 
 
-def _without_nan(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
     """Replace NaN by None, since JSON has none, and keys by strings."""
     if isinstance(value, float):
         return None if math.isnan(value) else value
     if isinstance(value, Mapping):
-        return {str(key): _without_nan(item) for key, item in value.items()}
+        return {str(key): without_nan(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         if value and all(isinstance(item, int) for item in value):
             return list(value)
-        return [_without_nan(item) for item in value]
+        return [without_nan(item) for item in value]
     return value
