@@ -5,6 +5,7 @@ import errno
 import os
 import pickle
 import shutil
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -199,6 +200,28 @@ def test_what_cannot_be_written_is_told_in_one_line(
     with pytest.raises(OutputError, match=rf"^{tmp_path}/c\.pt2: cannot be written \(No space left on device\)$"):
         export(str(artefacts.folder / "weights.safetensors"), format="torch", size="64x128", output=tmp_path / "c.pt2")
     assert [path.name for path in tmp_path.iterdir()] == ["a.onnx"]
+
+
+def test_an_interruption_leaves_no_half_of_an_artefact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ["a.bin", "a.xml"]
+    for name in names:
+        (tmp_path / name).write_text("old")
+    plain = Path.replace
+
+    def replace(path: Path, target: Path) -> Path:
+        os.kill(os.getpid(), signal.SIGINT)
+        return plain(path, target)
+
+    monkeypatch.setattr(Path, "replace", replace)
+
+    def put() -> None:
+        with command._trial(tmp_path / "a.xml") as trial:
+            for name in names:
+                trial.with_name(name).write_text("new")
+
+    with pytest.raises(KeyboardInterrupt):
+        put()
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == dict.fromkeys(names, "new")
 
 
 def _no_work(*_: object) -> Any:

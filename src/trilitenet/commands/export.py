@@ -32,6 +32,7 @@ from trilitenet.deploy.tensorrt import build_engine, is_installed, trtexec_line
 from trilitenet.deploy.triton import write_triton_repository
 from trilitenet.engine.evaluate import evaluate
 from trilitenet.errors import BackendError, ConfigError, InputError, OutputError, did_you_mean, writing
+from trilitenet.formats.writers.base import uninterrupted
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.exported import prepare_input
 from trilitenet.inference.predictor import Predictor
@@ -183,7 +184,8 @@ def export(
                 layout=layout,
                 frames=frames,
             )
-            write_triton_repository(exported.path, path.parent, network.card, name=path.name, overwrite=overwrite)
+            with uninterrupted():  # the former model has gone before the new one comes
+                write_triton_repository(exported.path, path.parent, network.card, name=path.name, overwrite=overwrite)
         serve = f"Serve it with: tritonserver --model-repository {path.parent.resolve()}"
         return dataclasses.replace(exported, path=path, notes=(*exported.notes, serve))
 
@@ -402,8 +404,9 @@ def _trial(path: Path) -> Iterator[Path]:
             path.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
                 yield Path(folder) / path.name
-                for part in Path(folder).iterdir():
-                    part.replace(path.parent / part.name)
+                with uninterrupted():  # files of an artefact belong together
+                    for part in Path(folder).iterdir():
+                        part.replace(path.parent / part.name)
     except OutputError as error:
         raise OutputError(str(error).replace(folder, str(path.parent))) from error
 
