@@ -53,8 +53,10 @@ def test_is_deterministic() -> None:
 
 
 def test_too_few_boxes_are_refused() -> None:
-    with pytest.raises(DataError, match="too few"):
+    with pytest.raises(DataError, match="8 boxes of 8 sizes are too few to fit 9 anchors"):
         fit_anchors(wide_boxes(8), DEFAULT_ANCHORS)
+    with pytest.raises(DataError, match="500 boxes of 1 sizes are too few to fit 9 anchors"):
+        fit_anchors(np.full((500, 2), 20.0), DEFAULT_ANCHORS)
 
 
 def test_recall_by_hand() -> None:

@@ -108,14 +108,17 @@ def fit_anchors(
         seed: Of k-means.
 
     Raises:
-        DataError: If there are too few boxes.
+        DataError: If there are too few boxes, or boxes of too few sizes.
         MissingExtraError: Without SciPy.
     """
     cluster: Any = import_extra("scipy.cluster.vq", "train")
     count = len(STRIDES) * PER_LEVEL
     sizes = sizes[(sizes >= min_side).all(axis=1)]
-    if len(np.unique(sizes, axis=0)) < count:
-        raise DataError(f"{len(sizes)} boxes are too few to fit {count} anchors; train with --no-auto-anchor")
+    different = len(np.unique(sizes, axis=0))
+    if different < count:
+        raise DataError(
+            f"{len(sizes)} boxes of {different} sizes are too few to fit {count} anchors; train with --no-auto-anchor"
+        )
     old = np.array(before, np.float64).reshape(-1, 2)
     # Ratios matter, not differences: clusters are sought in the logarithm of the sizes.
     centres, _ = cluster.kmeans(np.log(sizes), count, iter=20, seed=np.random.default_rng(seed))
