@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -200,3 +201,102 @@ def test_two_images_of_one_name_are_told_and_a_copy_is_not(tmp_path: Path) -> No
     cv2.imwrite(str(next(other.glob("a1.*"))), np.zeros((9, 9, 3), np.uint8))
     with pytest.raises(DataError, match="two images are called 'a1'"):
         read_bdd100k(root)
+
+
+AREA = {"category": "drivable area", "poly2d": raw_bdd.new_poly(raw_bdd.DIRECT, "LLLL", closed=True)}
+LANE = {"category": "lane", "attributes": {"laneType": "single white"}}
+
+
+def test_what_is_not_said_of_areas_and_lanes() -> None:
+    ring = {**LANE, "poly2d": raw_bdd.new_poly(raw_bdd.DIRECT, "LLLL", closed=True)}
+    edge = {**LANE, "poly2d": raw_bdd.new_poly(raw_bdd.CURB, "LL", closed=False)}
+    point = {**LANE, "poly2d": raw_bdd.new_poly([[1.0, 2.0]], "L", closed=False)}
+    thin = {**AREA, "poly2d": raw_bdd.new_poly(raw_bdd.CURB, "LL", closed=True)}
+    record = parse_labels({"labels": [AREA, ring, edge, point, thin]}, Path("x.jpg"), "x.json")
+    assert record.drivable is not None
+    assert record.lane is not None
+    assert [area.kind for area in record.drivable] == ["direct"]  # type: ignore[union-attr]
+    assert [(lane.category, lane.closed, lane.edge) for lane in record.lane] == [  # type: ignore[union-attr]
+        ("single white", True, False),
+        ("single white", False, True),
+    ]
+    assert record.dropped == {"lane with too few points": 1, "area with too few points": 1}
+
+
+def write_entries(path: Path, entries: list[dict[str, Any]]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(entries))
+
+
+def test_the_first_of_several_files_is_believed(tmp_path: Path) -> None:
+    raw_bdd.write_images(tmp_path)
+    raw_bdd.write_2020(tmp_path, masks="ids 2020")
+    write_entries(
+        tmp_path / "labels/lane/polygons/lane_train.json",
+        [{"name": "a1.jpg", "attributes": {"weather": "clear", "lanes": "4"}, "labels": []}],
+    )
+    record = read_bdd100k(tmp_path).record("train", "a1")
+    assert record.attributes == {**raw_bdd.ATTRIBUTES, "lanes": "4"}
+    assert isinstance(record.drivable, tuple)  # polygons before masks
+    assert record.lane == ()
+
+
+def test_a_file_is_of_the_task_that_its_name_says(tmp_path: Path) -> None:
+    raw_bdd.write_images(tmp_path)
+    write_entries(tmp_path / "labels/det_20/det_train.json", [{"name": "a1.jpg", "labels": []}])
+    source = read_bdd100k(tmp_path)
+    assert "labels from labels/det_20/det_train.json (detection)" in source.found[0]
+    assert source.record("train", "a1").objects == ()
+    assert source.record("train", "a2").objects is None
+
+
+def test_the_later_of_two_releases_is_read(tmp_path: Path) -> None:
+    raw_bdd.write_images(tmp_path)
+    for release, category in (("det_19", "car"), ("det_20", "bus")):
+        label = {"category": category, "box2d": {"x1": 1, "y1": 2, "x2": 9, "y2": 9}}
+        write_entries(tmp_path / f"labels/{release}/det_train.json", [{"name": "a1.jpg", "labels": [label]}])
+    objects = read_bdd100k(tmp_path).record("train", "a1").objects
+    assert objects is not None
+    assert [item.category for item in objects] == ["bus"]
+
+
+def test_documents_are_of_all_the_tasks_that_any_of_them_has(tmp_path: Path) -> None:
+    raw_bdd.write_images(tmp_path)
+    box = {"category": "car", "box2d": {"x1": 1, "y1": 2, "x2": 9, "y2": 9}}
+    lane = {"category": "lane/road curb", "poly2d": raw_bdd.old_poly(raw_bdd.CURB, "LL")}
+    for name, objects in (("a1", [box]), ("a2", [lane])):
+        path = tmp_path / f"labels/100k/train/{name}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps({"name": name, "frames": [{"objects": objects}]}))
+    first, second = (read_bdd100k(tmp_path).record("train", name) for name in ("a1", "a2"))
+    assert (first.lane, second.objects, first.drivable) == ((), (), None)
+    assert first.objects
+    assert second.lane
+
+
+def test_folders_that_are_links_are_followed_and_hidden_ones_are_not_looked_at(tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    raw_bdd.write_images(tmp_path / "elsewhere")
+    root.mkdir()
+    (root / "images").symlink_to(tmp_path / "elsewhere" / "images")
+    raw_bdd.write_2020(root)
+    raw_bdd.write_images(root / ".trash")
+    cv2.imwrite(str(root / ".trash/images/100k/train/a1.jpg"), np.zeros((9, 9, 3), np.uint8))
+    assert read_bdd100k(root).names("train") == ["a1", "a2"]
+
+
+def test_curves_are_curves_in_both_forms() -> None:
+    points = [[0.0, 0.0], [0.0, 40.0], [40.0, 40.0], [40.0, 0.0]]
+    forms = [raw_bdd.old_poly(points, "LCCC"), raw_bdd.new_poly(points, "LCCC", closed=False)]
+    lanes = [parse_labels({"labels": [{**LANE, "poly2d": form}]}, Path("x.jpg"), "x.json").lane for form in forms]
+    old, new = (np.asarray(lane[0].points) for lane in lanes if isinstance(lane, tuple))
+    np.testing.assert_array_equal(old, new)
+    assert np.abs(old - (20, 30)).sum(axis=1).min() < 1  # a cubic is there half-way: (0 + 3 x 40 + 3 x 40 + 0) / 8
+    assert old[:, 1].max() < 31
+
+
+def test_pictures_among_the_labels_are_no_images(tmp_path: Path) -> None:
+    (tmp_path / "labels" / "train").mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / "labels" / "train" / "a1.jpg"), np.zeros((9, 9, 3), np.uint8))
+    with pytest.raises(DataError, match="no BDD100K images"):
+        read_bdd100k(tmp_path)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import errno
 import importlib
+import io
 import json
 import signal
 import sys
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 
 from trilitenet.errors import ConfigError, OutputError, part_of
-from trilitenet.formats.writers.base import WRITERS, JsonStream, open_writer
+from trilitenet.formats.writers.base import WRITERS, JsonStream, open_writer, uninterrupted
 from trilitenet.structures import Boxes, Perception
 
 TASKS_GONE = Perception(size=(120, 200), class_names=("vehicle",), source="tasks.jpg")
@@ -34,7 +35,7 @@ def test_every_writer_takes_everything(
 ) -> None:
     unnamed = dataclasses.replace(pictures[0], source=None)
     with open_writer(format_name, tmp_path) as writer:
-        for perception in [*pictures, TASKS_GONE, unnamed, *video]:
+        for perception in [*pictures, TASKS_GONE, unnamed, unnamed, *video]:
             writer.write(perception)
     writer.close()
     assert writer.files
@@ -228,3 +229,80 @@ def test_a_first_frame_that_cannot_be_written_replaces_nothing(
     assert writer.files == []
     (tmp_path / f"{file}.part").rmdir()
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_source_that_ends_in_no_name_is_an_image(tmp_path: Path, pictures: list[Perception]) -> None:
+    with open_writer("coco", tmp_path) as writer:
+        assert writer.stem(dataclasses.replace(pictures[0], source="/")) == "image"
+
+
+def test_a_folder_of_that_name_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "coco.json").mkdir()
+    with pytest.raises(OutputError, match="exists"):
+        open_writer("coco", tmp_path)
+
+
+@pytest.mark.parametrize("name", ["csv", "jsonl"])
+def test_a_disk_that_is_full_from_the_beginning_leaves_no_file(
+    name: str, tmp_path: Path, video: list[Perception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Full(io.FileIO):
+        def write(self, data: Any) -> int:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("trilitenet.formats.writers.base.io.FileIO", Full)
+    with open_writer(name, tmp_path) as writer:
+        with pytest.raises(OSError, match="No space left"):
+            writer.write(video[0])
+        assert writer.files == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_picture_whose_file_is_there_does_not_keep_others_from_theirs(
+    tmp_path: Path, pictures: list[Perception]
+) -> None:
+    (tmp_path / "road.json").write_text("mine")
+    with open_writer("json", tmp_path) as writer:
+        with pytest.raises(OutputError, match="--overwrite"):
+            writer.write(pictures[0])
+        writer.write(dataclasses.replace(pictures[0], source="other.jpg"))
+    assert (tmp_path / "road.json").read_text() == "mine"
+    assert writer.files == [tmp_path / "other.json"]
+
+
+def test_a_disk_that_is_still_full_at_the_end_is_not_told_twice(
+    tmp_path: Path, pictures: list[Perception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(stream: JsonStream, *_: object, **__: object) -> None:
+        stream._handle.close()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(JsonStream, "add", full)
+    monkeypatch.setattr(JsonStream, "close", full)
+    with open_writer("coco", tmp_path) as writer, pytest.raises(OSError, match="No space left"):
+        writer.write(pictures[0])
+    assert list(tmp_path.iterdir()) == []
+    other = open_writer("coco", tmp_path)
+    with pytest.raises(OSError, match="No space left"), other:
+        pass  # nothing was told before
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_half_a_document_is_taken_back(
+    tmp_path: Path, pictures: list[Perception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def half(path: Path, text: str, encoding: str) -> None:
+        path.write_bytes(text[: len(text) // 2].encode())
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", half)
+    with pytest.raises(OSError, match="No space left"), open_writer("json", tmp_path) as writer:
+        writer.write(pictures[0])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interruption_that_is_ignored_stays_so(interruption: signal.Signals) -> None:
+    signal.signal(interruption, signal.SIG_IGN)
+    with uninterrupted():
+        signal.raise_signal(interruption)
+    assert signal.getsignal(interruption) is signal.SIG_IGN

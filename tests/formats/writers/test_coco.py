@@ -36,6 +36,8 @@ def test_pycocotools_opens_it(tmp_path: Path, pictures: list[Perception]) -> Non
     ]
     annotations = coco.loadAnns(coco.getAnnIds(imgIds=[1]))
     assert annotations[0]["bbox"] == [10.25, 20.0, 49.75, 30.5]
+    assert annotations[0]["area"] == 1517.38  # 49.75 x 30.5
+    assert annotations[2]["bbox"] == [20, 60, 161, 60]  # columns 20 to 180, rows 60 to 119
     assert annotations[0]["score"] == 0.9
     np.testing.assert_array_equal(coco.annToMask(annotations[2]).astype(bool), pictures[0].drivable)
     np.testing.assert_array_equal(coco.annToMask(annotations[3]).astype(bool), pictures[0].lane)

@@ -46,6 +46,38 @@ def test_pictures(tmp_path: Path, pictures: list[Perception]) -> None:
     for node, mask in zip(images[0].findall("mask"), (pictures[0].drivable, pictures[0].lane), strict=True):
         np.testing.assert_array_equal(decode(node, pictures[0].size), mask)
     assert len(images[1]) == 0
+    assert [image.get("id") for image in images] == ["0", "1"]
+    orders = {node.tag: node.get("z_order") for node in images[0]}
+    assert orders == {"mask": "0", "box": "1"}  # boxes lie above what they stand on
+
+
+def test_names_are_whatever_they_are(tmp_path: Path, pictures: list[Perception]) -> None:
+    odd = dataclasses.replace(pictures[0], source='a&"<b>.jpg', class_names=("vehicle", 'rider & "bike" <2>'))
+    (image,) = write(tmp_path, [odd]).findall("image")
+    assert image.get("name") == 'a&"<b>.jpg'
+    root = write(tmp_path / "video", [dataclasses.replace(odd, frame=0)])
+    assert [box.get("label") for box in image.findall("box")] == ["vehicle", 'rider & "bike" <2>']
+    assert 'rider & "bike" <2>' in {name.text for name in root.iter("name")}
+    assert 'rider & "bike" <2>' in {track.get("label") for track in root.findall("track")}
+
+
+def test_each_video_has_a_file(tmp_path: Path, video: list[Perception]) -> None:
+    other = [dataclasses.replace(frame, source="other.mp4") for frame in video[:2]]
+    with CvatWriter(tmp_path) as writer:
+        for frame in [*video, *other]:
+            writer.write(frame)
+    sizes = {path.name: ElementTree.parse(path).getroot().findtext("meta/task/size") for path in writer.files}
+    assert sizes == {"drive.cvat-video.xml": "4", "other.cvat-video.xml": "2"}
+
+
+def test_polygons_of_a_video_are_in_the_middle_of_pixels(tmp_path: Path) -> None:
+    mask = np.zeros((20, 30), np.bool_)
+    mask[5:15, 10:21] = True
+    root = write(tmp_path, [Perception((20, 30), drivable=mask, source="a.mp4", frame=0)])
+    (polygon,) = root.iter("polygon")
+    points = {tuple(map(float, point.split(","))) for point in polygon.attrib["points"].split(";")}
+    assert points == {(10.5, 5.5), (10.5, 14.5), (20.5, 14.5), (20.5, 5.5)}
+    assert polygon.get("z_order") == "0"
 
 
 @pytest.mark.parametrize(
@@ -76,6 +108,14 @@ def test_video_ends_tracks_where_they_end(tmp_path: Path, video: list[Perception
     assert len(lanes) == 2
     assert [(shape.get("frame"), shape.get("outside")) for shape in lanes[0]][-1] == ("3", "1")
     assert root.findtext("meta/task/size") == "4"
+
+
+def test_a_track_that_changes_its_class_is_two(tmp_path: Path, video: list[Perception]) -> None:
+    boxes = video[1].boxes
+    assert boxes is not None
+    changed = dataclasses.replace(video[1], boxes=dataclasses.replace(boxes, class_id=1 - boxes.class_id))
+    tracks = [track for track in write(tmp_path, [video[0], changed]).findall("track") if track.find("box") is not None]
+    assert sorted(track.get("label") or "" for track in tracks) == ["rider & bike"] * 2 + ["vehicle"] * 2
 
 
 def test_skipped_frames_do_not_hide_a_track(tmp_path: Path, video: list[Perception]) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,18 @@ def test_pictures_and_videos_follow_the_schema(
     for document in documents:
         validator.validate(document)
     assert [frame["frame"] for frame in documents[2]["frames"]] == [0, 1, 2, 3]
+    assert documents[2]["source"] == "drive.mp4"
     back = Perception.from_dict(documents[0])
     np.testing.assert_array_equal(back.lane, pictures[0].lane)
+
+
+def test_each_video_has_a_file(tmp_path: Path, video: list[Perception]) -> None:
+    other = [dataclasses.replace(frame, source="other.mp4") for frame in video[:2]]
+    with JsonWriter(tmp_path) as writer:
+        for frame in [*video, *other]:
+            writer.write(frame)
+    documents = {path.name: json.loads(path.read_text(encoding="utf-8")) for path in writer.files}
+    assert {name: len(document["frames"]) for name, document in documents.items()} == {"drive.json": 4, "other.json": 2}
 
 
 @pytest.mark.parametrize(

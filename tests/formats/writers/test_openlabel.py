@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import json
 from importlib import resources
 from pathlib import Path
@@ -11,7 +12,7 @@ import jsonschema
 import numpy as np
 import pytest
 
-from trilitenet.formats.writers.openlabel import OpenLabelWriter
+from trilitenet.formats.writers.openlabel import OpenLabelWriter, _intervals
 from trilitenet.road.structures import Road
 from trilitenet.structures import Perception
 
@@ -52,6 +53,7 @@ def test_boxes_and_masks_come_back(tmp_path: Path, pictures: list[Perception]) -
     image = objects["0"]["object_data"]["image"][0]
     mask = cv2.imdecode(np.frombuffer(base64.b64decode(image["val"]), np.uint8), cv2.IMREAD_GRAYSCALE)
     np.testing.assert_array_equal(mask == 255, pictures[0].drivable)
+    assert base64.b64decode(image["val"])[24] == 1  # bit a pixel
     assert content["streams"]["camera"]["uri"] == "day/road.jpg"
 
 
@@ -65,6 +67,34 @@ def test_objects_say_when_they_were_seen(tmp_path: Path, video: list[Perception]
     assert content["objects"]["1"]["frame_intervals"] == [{"frame_start": 0, "frame_end": 2}]
     assert content["frame_intervals"] == [{"frame_start": 0, "frame_end": 3}]
     assert content["frames"]["3"]["frame_properties"]["timestamp"] == 0.12
+
+
+def test_pictures_without_a_name_have_a_file_each(tmp_path: Path, pictures: list[Perception]) -> None:
+    documents = write(tmp_path, [dataclasses.replace(picture, source=None) for picture in pictures])
+    assert [list(document["openlabel"]["frames"]) for document in documents] == [["0"], ["0"]]
+
+
+def test_time_is_told_to_the_microsecond(tmp_path: Path, video: list[Perception]) -> None:
+    frames = [dataclasses.replace(frame, timestamp=index / 30) for index, frame in enumerate(video)]
+    content = write(tmp_path, frames)[0]["openlabel"]["frames"]
+    assert [content[str(index)]["frame_properties"]["timestamp"] for index in range(3)] == [0, 0.033333, 0.066667]
+
+
+def test_intervals_by_hand() -> None:
+    ends = [(one["frame_start"], one["frame_end"]) for one in _intervals([0, 0, 1, 3, 3, 4])]
+    assert ends == [(0, 1), (3, 4)]
+
+
+def test_a_line_and_a_track_of_one_number_are_two_objects(tmp_path: Path, video: list[Perception], road: Road) -> None:
+    boxes = video[0].boxes
+    assert boxes is not None
+    (line,) = road.to_dict()["lines"]
+    tracked = dataclasses.replace(boxes, track_id=np.array([line["id"], -1]))
+    with OpenLabelWriter(tmp_path) as writer:
+        writer.write(dataclasses.replace(video[0], boxes=tracked), road.to_dict())
+    objects = json.loads(writer.files[0].read_text(encoding="utf-8"))["openlabel"]["objects"]
+    kinds = [thing["type"] for thing in objects.values()]
+    assert sorted(kinds) == ["drivable area", "lane line", "lane marking", "rider & bike", "vehicle"]
 
 
 def test_the_road_is_objects_and_a_context(tmp_path: Path, video: list[Perception], road: Road) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any, Optional, Union
@@ -58,6 +59,13 @@ def test_labels_are_as_documented(tmp_path: Path, pictures: list[Perception]) ->
     assert labels[0].box2d == Box2D(x1=10.25, y1=20.0, x2=60.0, y2=50.5)
     np.testing.assert_array_equal(decode_mask(document["frames"][0]["labels"][2]["rle"]), pictures[0].drivable)
     assert document["frames"][1]["labels"] == []
+    assert document["config"]["categories"] == [
+        {"name": "vehicle", "isThing": True},
+        {"name": "rider & bike", "isThing": True},
+        {"name": "drivable", "isThing": False},
+        {"name": "lane", "isThing": False},
+        {"name": "lane line", "isThing": True},
+    ]
 
 
 def test_video(tmp_path: Path, video: list[Perception]) -> None:
@@ -67,6 +75,14 @@ def test_video(tmp_path: Path, video: list[Perception]) -> None:
     assert [frame["labels"][0]["id"] for frame in frames][::3] == ["track-7", "track-7"]
     identities = [label["id"] for frame in frames for label in frame["labels"] if "track" not in label["id"]]
     assert len(set(identities)) == len(identities)
+
+
+def test_the_first_track_is_number_zero(tmp_path: Path, video: list[Perception]) -> None:
+    boxes = video[0].boxes
+    assert boxes is not None
+    first = dataclasses.replace(video[0], boxes=dataclasses.replace(boxes, track_id=np.array([0, -1])))
+    (frame,) = write(tmp_path, [first])["frames"]
+    assert [label["id"] for label in frame["labels"][:2]] == ["track-0", "1"]
 
 
 def test_scalabel_opens_it(tmp_path: Path, video: list[Perception]) -> None:
