@@ -37,6 +37,13 @@ def test_good_anchors_are_kept() -> None:
     fit = fit_anchors(boxes, old)
     assert fit.anchors == old
     assert fit.fit_after == pytest.approx(1.0)
+    assert not fit.changed
+    assert "anchors kept" in fit.summary()
+
+
+def test_boxes_that_are_thinner_than_two_pixels_are_left_out() -> None:
+    thin = np.full((50, 2), [100.0, 1.9])
+    assert fit_anchors(np.concatenate([wide_boxes(), thin]), DEFAULT_ANCHORS).boxes == 600
 
 
 def test_anchors_that_suit_well_enough_are_kept() -> None:
@@ -60,8 +67,8 @@ def test_too_few_boxes_are_refused() -> None:
 
 
 def test_recall_by_hand() -> None:
-    sizes = np.array([[10.0, 10.0], [39.0, 10.0], [41.0, 10.0]])
-    assert best_possible_recall(sizes, np.array([[10.0, 10.0]])) == pytest.approx(2 / 3)
+    sizes = np.array([[10.0, 10.0], [39.0, 10.0], [40.0, 10.0], [41.0, 10.0]])  # four times is too much
+    assert best_possible_recall(sizes, np.array([[10.0, 10.0]])) == 2 / 4
 
 
 class _Source:

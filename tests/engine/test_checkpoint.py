@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import random
 import subprocess
 import sys
@@ -10,7 +11,14 @@ import numpy as np
 import pytest
 import torch
 
-from trilitenet.engine.checkpoint import random_state, read_checkpoint, set_random_state, write_checkpoint
+from trilitenet.data.loader import WORKER_LOST
+from trilitenet.engine.checkpoint import (
+    CHECKPOINT_SCHEMA,
+    random_state,
+    read_checkpoint,
+    set_random_state,
+    write_checkpoint,
+)
 from trilitenet.errors import OutputError, WeightsError
 
 
@@ -38,6 +46,37 @@ def test_random_states_go_round(tmp_path: Path) -> None:
     first = draw()
     set_random_state(read_checkpoint(tmp_path / "c")["random"])
     assert draw() == first
+
+
+def test_the_second_of_two_normal_numbers_comes_after_the_first(tmp_path: Path) -> None:
+    np.random.seed(0)  # noqa: NPY002
+    np.random.standard_normal()  # noqa: NPY002 - they are drawn in pairs, and the other one is kept
+    write_checkpoint(tmp_path / "c", whole(random=random_state()))
+    second = np.random.standard_normal()  # noqa: NPY002
+    np.random.standard_normal()  # noqa: NPY002
+    set_random_state(read_checkpoint(tmp_path / "c")["random"])
+    assert np.random.standard_normal() == second  # noqa: NPY002
+
+
+def test_a_checkpoint_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "last.ckpt"
+    named: list[bool] = []
+    monkeypatch.setattr("os.fsync", lambda number: named.append(path.exists()))
+    write_checkpoint(path, whole())
+    assert named == [False]
+
+
+def test_a_worker_that_was_killed_meanwhile_is_no_fault_of_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def save(*arguments: object) -> None:
+        raise RuntimeError(f"{WORKER_LOST} (pid 7) is killed by signal: Killed.")
+
+    monkeypatch.setattr("torch.save", save)
+    with pytest.raises(RuntimeError, match=r"\(pid 7\) is killed") as caught:
+        write_checkpoint(tmp_path / "last.ckpt", whole())
+    assert not isinstance(caught.value, OutputError)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_killed_in_the_middle_of_writing_leaves_the_old_one(tmp_path: Path) -> None:
@@ -70,7 +109,7 @@ def test_a_damaged_file_is_named(tmp_path: Path, content: bytes) -> None:
 def test_a_missing_file_and_a_newer_layout_are_refused(tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match="no such checkpoint"):
         read_checkpoint(tmp_path / "none.ckpt")
-    torch.save({"schema": 99}, tmp_path / "new.ckpt")
+    torch.save({"schema": CHECKPOINT_SCHEMA + 1}, tmp_path / "new.ckpt")
     with pytest.raises(WeightsError, match="newer than this version"):
         read_checkpoint(tmp_path / "new.ckpt")
 
@@ -107,3 +146,16 @@ def test_a_place_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write the checkpoint"):
         write_checkpoint(tmp_path / "file" / "last.ckpt", {})
+
+
+def test_a_full_disk_is_told_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def save(*arguments: object) -> None:
+        try:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        except OSError:
+            raise RuntimeError("unexpected pos 64 vs 0")  # noqa: B904 - as PyTorch does
+
+    monkeypatch.setattr("torch.save", save)
+    with pytest.raises(OutputError, match="No space left on device"):
+        write_checkpoint(tmp_path / "last.ckpt", whole())
+    assert list(tmp_path.iterdir()) == []

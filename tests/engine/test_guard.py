@@ -64,6 +64,13 @@ def test_without_waiting_the_optimiser_skips_by_itself() -> None:
     assert bool((network.weight < weight).all())
 
 
+def test_without_waiting_a_bad_step_that_is_looked_at_was_skipped_by_itself() -> None:
+    _, _, guard = make(2)
+    assert guard.good(0, (), GOOD, GOOD)
+    assert guard.good(1, (), BAD, GOOD)
+    assert guard.bad_steps == 1
+
+
 def test_an_average_that_has_followed_a_bad_step_is_put_back_too() -> None:
     network = nn.BatchNorm1d(2)
     average = nn.BatchNorm1d(2)

@@ -123,9 +123,10 @@ def test_confidence_makes_objects_and_ignored_regions(tmp_path: Path) -> None:
     taught = TaughtTransform(TrainTransform(SIZE, Augmentation(rotation=0, scale=0, translation=0, flip=0)), lessons)
     out = taught(bare(sample), np.random.default_rng(0))
     assert out.ignored.tolist() == [[0, 0, 9, 9], [90, 20, 130, 60]]
-    doubtful = Lessons(tmp_path, ("vehicle",), (0.4, 0.5)).of(bare(sample))
-    assert doubtful is not None
-    assert not len(doubtful.ignored)
+    for low, count in ((0.4, 0), (0.3, 1)):
+        doubtful = Lessons(tmp_path, ("vehicle",), (low, 0.5)).of(bare(sample))
+        assert doubtful is not None
+        assert len(doubtful.ignored) == count
 
 
 def test_outputs_follow_a_smaller_image(tmp_path: Path) -> None:
@@ -155,10 +156,20 @@ def test_an_image_the_teacher_never_saw_keeps_its_labels(tmp_path: Path) -> None
 def test_a_task_the_teacher_lacks_keeps_its_labels(tmp_path: Path) -> None:
     sample = scene()
     save(tmp_path, dataclasses.replace(sample, lane=None, drivable=None))
-    taught = TaughtTransform(TrainTransform(SIZE, Augmentation()), Lessons(tmp_path, ("vehicle",)), (9.0, 9.0, 9.0))
+    lessons = Lessons(tmp_path, ("vehicle",))
+    taught = TaughtTransform(TrainTransform(SIZE, Augmentation()), lessons, (9.0, 9.0, 9.0))
     out = taught(sample, np.random.default_rng(0))
     assert out.lane is not None
     assert out.lane.any()
+    assert lessons.of(scene("b")) is None  # the list names no image without boxes, so this one was perhaps never seen
+
+
+def test_a_task_of_weight_zero_is_not_taught(tmp_path: Path) -> None:
+    lessons = Lessons(save(tmp_path, scene()), ("vehicle",))
+    taught = TaughtTransform(TrainTransform(SIZE, Augmentation()), lessons, (0.0, 1.0, 0.0))
+    out = taught(bare(scene()), np.random.default_rng(0))
+    assert (out.boxes, out.lane) == (None, None)
+    assert out.drivable is not None
 
 
 def test_refusals(tmp_path: Path) -> None:
@@ -174,6 +185,9 @@ def test_refusals(tmp_path: Path) -> None:
         Lessons(folder, ("vehicle",)).of(sample)
     cv2.imwrite(str(folder / "drivable" / "a.png"), np.zeros((100, 100), np.uint8))
     with pytest.raises(DataError, match="100x100, of another shape than the image of 160x96"):
+        Lessons(folder, ("vehicle",)).of(sample)
+    cv2.imwrite(str(folder / "drivable" / "a.png"), np.zeros((96, 152), np.uint8))
+    with pytest.raises(DataError, match="152x96, of another shape"):
         Lessons(folder, ("vehicle",)).of(sample)
     (folder / "drivable" / "a.png").write_bytes(b"no")
     with pytest.raises(DataError, match="not a PNG"):

@@ -14,6 +14,7 @@ def test_csv_goes_on_without_what_came_after(tmp_path: Path) -> None:
     logger = CsvLogger(path)
     for step in range(1, 5):
         logger.log({"loss": step / 3}, step)
+    assert read_csv(path)[-1] == (4, "loss", 4 / 3)  # at once: a run that is killed keeps it
     logger.close()
     logger = CsvLogger(path, step=2)
     logger.log({"loss": 9.0}, 3)
@@ -23,8 +24,8 @@ def test_csv_goes_on_without_what_came_after(tmp_path: Path) -> None:
 
 def test_a_line_that_was_cut_off_is_left_out(tmp_path: Path) -> None:
     path = tmp_path / "metrics.csv"
-    for end in ("8,val/lan", "8", "8,val/lane,0.", "8,val/lane,x\n"):
-        path.write_text(f"step,name,value\n4,loss,2.0\n{end}")
+    for end in (b"8,val/lan", b"8", b"8,val/lane,0.", b"8,val/lane,x\n", b"8,val/lan\xff"):
+        path.write_bytes(b"step,name,value\n4,loss,2.0\n" + end)
         logger = CsvLogger(path, 7)
         logger.log({"loss": 1.0}, 8)
         logger.close()
@@ -81,7 +82,25 @@ def test_mlflow_and_wandb_are_told_everything(tmp_path: Path, monkeypatch: pytes
 
     monkeypatch.setitem(sys.modules, "mlflow", Fake())
     monkeypatch.setitem(sys.modules, "wandb", Fake())
-    for logger in build_loggers(["mlflow", "wandb"], tmp_path / "run", {"lr": 1}):
+    for logger in build_loggers(["mlflow", "wandb"], tmp_path / "run", {"lr": 1, "classes": "x" * 300}):
         logger.log({"loss": 2.0}, 5)
         logger.close()
-    assert told == ["run", {"lr": "1"}, {"lr": 1}, ({"loss": 2.0}, 5), "end", ({"loss": 2.0}, 5), "end"]
+    shown = {"lr": "1", "classes": "x" * 250}  # MLflow takes no more of each
+    ends = [({"loss": 2.0}, 5), "end"]
+    assert told == ["run", shown, {"lr": 1, "classes": "x" * 300}, *ends, *ends]
+
+
+@pytest.mark.parametrize(("step", "purged"), [(0, None), (7, 8)])
+def test_tensorboard_forgets_what_came_after(
+    step: int, purged: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[object] = []
+
+    class Fake:
+        @staticmethod
+        def SummaryWriter(folder: str, *, purge_step: int | None) -> None:  # noqa: N802
+            told.append(purge_step)
+
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", Fake())
+    build_loggers(["tensorboard"], tmp_path, {}, step)
+    assert told == [purged]

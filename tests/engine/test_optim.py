@@ -17,7 +17,7 @@ def test_warm_up_then_cosine_to_the_final_rate() -> None:
     assert rates[0] == pytest.approx(0.0001)
     assert max(rates) == pytest.approx(rates[10], rel=0.03)
     assert rates[50] == pytest.approx(0.001 * (0.2 + 0.8 * 0.5))
-    assert rates[100] == pytest.approx(0.0002)
+    assert rates[100] == schedule.rate(150) == pytest.approx(0.0002)
     assert all(later < earlier for earlier, later in itertools.pairwise(rates[10:]))
 
 
@@ -28,13 +28,13 @@ def test_stairs_keep_the_rate_within_an_epoch() -> None:
 
 
 def test_only_weights_decay_unless_told() -> None:
-    module = nn.Sequential(nn.Conv2d(2, 3, 1), nn.BatchNorm2d(3), nn.PReLU(3))
+    module = nn.Sequential(nn.Conv2d(2, 3, 1), nn.BatchNorm2d(3), nn.PReLU(3), nn.Linear(3, 2))
     decayed, free = parameter_groups([module], 0.1)
-    assert [p.shape for p in decayed["params"]] == [(3, 2, 1, 1)]
-    assert len(free["params"]) == 4
+    assert [p.shape for p in decayed["params"]] == [(3, 2, 1, 1), (2, 3)]
+    assert len(free["params"]) == 5
     assert (decayed["weight_decay"], free["weight_decay"]) == (0.1, 0.0)
     (group,) = parameter_groups([module], 0.1, decay_all=True)
-    assert len(group["params"]) == 5
+    assert len(group["params"]) == 7
 
 
 def test_apply_sets_every_group() -> None:

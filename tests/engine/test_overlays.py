@@ -79,3 +79,35 @@ def test_a_box_of_another_class_is_false_and_one_on_the_own_car_is_not_drawn() -
     picture = _decoded(error_overlay(small, sample, seen, "detection", confidence=0.25))
     np.testing.assert_allclose(picture[133, 100], FALSE, atol=40)
     assert not picture[200:, 230:340].any()
+
+
+def test_a_box_that_is_found_is_not_missed_beside() -> None:
+    black = np.zeros((720, 1280, 3), np.uint8)
+    truth = np.array([[300, 300, 600, 600]], np.float32)
+    sample = Sample(name="a", image=black, boxes=truth, class_id=np.zeros(1, np.int64))
+    boxes = Boxes(truth + np.array([60, 0, 60, 0], np.float32), np.array([0.9], np.float32), np.zeros(1, np.int64))
+    picture = _decoded(error_overlay(shrunken(black), sample, _perception(boxes=boxes), "detection", confidence=0.25))
+    np.testing.assert_allclose(picture[150, 120], RIGHT, atol=40)
+    assert not picture[150, 96:105].any()
+
+
+def test_another_class_is_false_where_it_is_labelled_though_the_region_is_ignored() -> None:
+    black = np.zeros((720, 1280, 3), np.uint8)
+    truth = np.array([[300, 300, 600, 600]], np.float32)
+    region = np.array([[150, 150, 750, 690]], np.float32)
+    boxes = Boxes(truth, np.array([0.9], np.float32), np.ones(1, np.int64))
+    seen = Perception(size=(720, 1280), class_names=("car", "bus"), boxes=boxes)
+    for labels, colour in ((truth, FALSE), (truth[:0], (0, 0, 0))):
+        sample = Sample(name="a", image=black, boxes=labels, class_id=np.zeros(len(labels), np.int64), ignored=region)
+        picture = _decoded(error_overlay(shrunken(black), sample, seen, "detection", confidence=0.25))
+        np.testing.assert_allclose(picture[150, 100], colour, atol=40)
+
+
+def test_a_lower_quality_takes_fewer_bytes() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (90, 160, 3), dtype=np.uint8)
+    sample = Sample(name="a", image=image)
+    sizes = [
+        len(error_overlay(image, sample, _perception(), "lane", confidence=0.25, quality=quality))
+        for quality in (20, 80)
+    ]
+    assert sizes[0] < sizes[1] / 2

@@ -109,6 +109,8 @@ def test_a_part_that_is_not_there_is_a_task_that_is_not_scored(tmp_path: Path) -
         ('[{"image_id": "a"}]', "not COCO results"),
         ('[{"image_id": "a", "category_id": 1, "bbox": [0, 0, 1], "score": 0.5}]', "not COCO results"),
         ('[{"image_id": "a", "category_id": 1, "bbox": [0, 0, 1, 1], "score": 50}]', "between 0 and 1"),
+        ('[{"image_id": "a", "category_id": 1, "bbox": [0, 0, 1, 1], "score": -0.5}]', "between 0 and 1"),
+        ('[{"image_id": "a", "category_id": 0, "bbox": [0, 0, 1, 1], "score": 0.5}]', "category_id 0 is not 1 to 2"),
         ('[{"image_id": "a", "category_id": 3, "bbox": [0, 0, 1, 1], "score": 0.5}]', "category_id 3 is not 1 to 2"),
         ("[{", "not COCO results"),
         ("", "not COCO results"),

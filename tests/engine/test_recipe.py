@@ -65,13 +65,25 @@ def test_the_resolved_configuration_reads_back(tmp_path: Path) -> None:
         ("- 1", "must hold 'key: value' lines"),
         ("a: [", "not YAML"),
         ("base: r.yaml", "its own base"),
+        ("base: ./sub/../r.yaml", "its own base"),
+        ("seed: 9223372036854775808", r"seed must be below 2\*\*63"),
+        ("betas: [1, 0.9]", r"betas must be in \[0, 1\)"),
+        ("teacher_confidence: [0.6, 0.5]", "the lower first"),
     ],
 )
 def test_a_wrong_recipe_is_named(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "r.yaml"
     path.write_text(text)
+    (tmp_path / "sub").mkdir()
     with pytest.raises(ConfigError, match=message):
         read_recipe(path)
+
+
+def test_the_ends_of_what_is_allowed() -> None:
+    config = TrainConfig(
+        betas=(0.0, 0.0), ema_decay=0.0, teacher_confidence=(0.3, 0.3), multi_scale=(1.0, 1.0), seed=2**63 - 1
+    )
+    assert config.multi_scale == (1.0, 1.0)
 
 
 def test_a_missing_file_is_an_error(tmp_path: Path) -> None:

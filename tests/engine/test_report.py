@@ -117,6 +117,13 @@ def test_real_differences_are_told_from_chance(report: Report) -> None:
     text = comparison.summary()
     assert "exact" in text
     assert "*" in text
+    assert f"({100 * lane.low:+.1f} to {100 * lane.high:+.1f})*" in " ".join(text.split())
+    worse = compare_reports({"exact": better, "drifting": report}, resamples=200).difference(
+        "drifting", "fair/lane/iou"
+    )
+    assert worse is not None
+    assert (worse.value, worse.real) == (-lane.value, True)
+    assert worse.low <= worse.value <= worse.high < 0
 
 
 def test_reports_of_other_images_or_labels_are_not_paired(report: Report) -> None:
@@ -143,6 +150,8 @@ def test_reports_of_other_images_or_labels_are_not_paired(report: Report) -> Non
     comparison = compare_reports({"a": first, "b": lanes_alone}, resamples=10)
     assert not comparison.unpaired
     assert list(comparison.confidence) == ["a"]
+    others = dataclasses.replace(report, names=tuple(f"other {name}" for name in report.names))
+    assert not compare_reports({"a": report, "b": others}, resamples=10).differences  # as many, but not the same
     settings = {**report.provenance.settings, "paper_batch": 3}
     batches = dataclasses.replace(report, provenance=dataclasses.replace(report.provenance, settings=settings))
     fair = report.state["fair"]

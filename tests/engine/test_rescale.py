@@ -46,6 +46,17 @@ def test_masks_stay_where_their_pixels_are() -> None:
         assert int(moved.lane[0, 9].sum()) == pytest.approx(51 * size[1] / 128, abs=0.5)
 
 
+def test_what_lies_between_the_new_pixels_counts_too() -> None:
+    whole = batch()
+    whole.images[:] = 0
+    whole.images[..., 3::4] = 203
+    narrow = rescale(whole, (64, 32))
+    # Every fourth column is bright; of four that become one, the middle two are dark.
+    assert set(narrow.images[..., 1:-1].unique().tolist()) == {51}  # 203 / 4 = 50.75
+    assert narrow.boxes.tolist() == [[0, 0, 8.0, 48.0, 4.0, 8.0]]
+    assert narrow.ignored.tolist() == [[0, 25.0, 10.0, 5.0, 20.0]]
+
+
 def test_the_same_size_changes_nothing() -> None:
     whole = batch()
     assert rescale(whole, (64, 128)) is whole
@@ -57,3 +68,4 @@ def test_sizes_are_multiples_of_32_and_depend_on_seed_and_step_alone() -> None:
     assert all(side % 32 == 0 for size in sizes for side in size)
     assert len(set(sizes)) > 5
     assert draw_size((384, 640), (1.0, 1.0), 0, 0) == (384, 640)
+    assert draw_size((64, 640), (0.1, 0.1), 0, 0) == (32, 64)  # not 0 rows

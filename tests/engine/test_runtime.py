@@ -75,11 +75,14 @@ def ended(pid: int) -> bool:
 @pytest.mark.slow
 def test_runs_follow_one_another_and_leave_no_trace(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MASTER_ADDR", "192.0.2.1")  # left by something else
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(runtime, "usable_cores", lambda: 6)
     before, threads = dict(os.environ), torch.get_num_threads()
     for _ in range(2):
         with pair(script, "fabric.all_reduce(torch.tensor(3.0))") as fabric:
             assert (fabric.global_rank, fabric.world_size) == (0, 2)
             assert float(fabric.all_reduce(torch.tensor(1.0))) == 2.0
+            assert torch.get_num_threads() == 3
     assert not torch.distributed.is_initialized()
     assert (dict(os.environ), torch.get_num_threads()) == (before, threads)
 
@@ -114,6 +117,57 @@ def test_the_second_process_is_quiet_when_the_first_fails(script: Path, capfd: p
     assert started
     assert all(ended(int(child)) for child in started)
     assert capfd.readouterr().err == ""
+
+
+def test_a_process_whose_terminal_has_gone_was_killed_too() -> None:
+    class Process:
+        def poll(self) -> int:
+            return -signal.SIGHUP
+
+    others = runtime._Others()
+    others._processes = [Process()]  # type: ignore[list-item]
+    assert others.reason().startswith("process 1 was killed (SIGHUP)")
+
+
+@pytest.mark.parametrize(
+    ("precision", "device", "cuda", "native", "picked"),
+    [
+        ("auto", "cuda", True, False, "bf16-mixed"),
+        ("auto", "cuda", False, True, "16-mixed"),
+        ("auto", "auto", True, False, "bf16-mixed"),
+        ("auto", "auto", None, True, "bf16-mixed"),
+        ("auto", "auto", None, False, "32-true"),
+        ("auto", "cpu", True, True, "bf16-mixed"),
+        ("auto", "cpu", True, False, "32-true"),
+        ("auto", "mps", None, True, "32-true"),
+        ("16-mixed", "cpu", None, True, "16-mixed"),
+    ],
+)
+def test_the_precision_that_a_device_computes_in(
+    precision: str, device: str, cuda: bool | None, native: bool, picked: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A CUDA device that has bf16, or has it not, or none."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda is not None)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda: bool(cuda))
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: native)
+    assert runtime.pick_precision(precision, device) == picked
+
+
+def test_the_first_wish_to_stop_is_noted_and_a_second_ctrl_c_is_one() -> None:
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, signal.default_int_handler) for number in numbers]
+    try:
+        with runtime.StopRequest() as stop:
+            assert not stop
+            signal.raise_signal(signal.SIGTERM)
+            assert stop
+            signal.raise_signal(signal.SIGTERM)  # whoever sends it may repeat it
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        assert [signal.getsignal(number) for number in numbers] == [signal.default_int_handler] * 2
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 def test_a_port_that_is_taken_is_named(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,3 +58,5 @@ def test_frozen_parts_learn_nothing() -> None:
 def test_an_unknown_part_is_named() -> None:
     with pytest.raises(ConfigError, match="did you mean 'encoder'"):
         freeze(build_network("tiny"), ("encodr",))
+    with pytest.raises(ConfigError, match="no part ''"):
+        freeze(build_network("tiny"), ("",))
