@@ -108,7 +108,16 @@ def test_gradient_at_zero_is_that_of_pytorch() -> None:
 
 @pytest.mark.parametrize(
     ("name", "part"),
-    [("act", nn.ReLU()), ("act", nn.PReLU()), ("act", PReLU(1)), ("bn", nn.GroupNorm(2, 8)), ("bn", nn.Identity())],
+    [
+        ("act", nn.ReLU()),
+        ("act", nn.PReLU()),
+        ("act", PReLU(1)),
+        ("bn", nn.GroupNorm(2, 8)),
+        ("bn", nn.Identity()),
+        ("bn", nn.BatchNorm2d(8, momentum=None)),
+        ("bn", nn.BatchNorm2d(8, affine=False)),
+        ("bn", nn.BatchNorm2d(8, track_running_stats=False)),
+    ],
 )
 def test_other_layers_may_take_their_places(name: str, part: nn.Module) -> None:
     block = ConvBNPReLU(3, 8).train()
@@ -125,3 +134,7 @@ def test_hooks_are_called() -> None:
     block.act.register_forward_hook(lambda *_: called.append("act"))
     block(torch.randn(2, 3, 8, 8).to(memory_format=torch.channels_last))
     assert called == ["bn", "act"]
+    block, called = ConvBNPReLU(3, 8).train(), []
+    block.act.register_forward_hook(lambda *_: called.append("act alone"))
+    block(torch.randn(2, 3, 8, 8).to(memory_format=torch.channels_last))
+    assert called == ["act alone"]

@@ -128,3 +128,16 @@ def test_a_fresh_head_expects_eight_objects_an_image() -> None:
         assert isinstance(conv.bias, torch.Tensor)
         objectness = conv.bias.detach().view(3, -1)[:, 4]
         assert objectness.tolist() == pytest.approx([math.log(8 / (640 / stride) ** 2)] * 3, abs=0.2)
+
+
+@pytest.mark.parametrize(("classes", "bias"), [(1, 4.094), (2, -0.521), (10, -2.709)])
+def test_a_fresh_head_expects_every_class_alike(classes: int, bias: float) -> None:
+    for conv in DetectionHead(64, classes).convs:
+        assert isinstance(conv.bias, torch.Tensor)
+        assert conv.bias.detach().view(3, -1)[:, 5:].flatten().tolist() == pytest.approx([bias] * 3 * classes, abs=0.2)
+
+
+def test_normalisations_are_the_published_ones() -> None:
+    norms = [module for module in build_network("tiny").modules() if isinstance(module, torch.nn.BatchNorm2d)]
+    assert norms
+    assert {(norm.eps, norm.momentum) for norm in norms} == {(1e-3, 0.03)}

@@ -18,6 +18,7 @@ from trilitenet.errors import ConfigError, ShapeError
 from trilitenet.models.attention import PCAA
 from trilitenet.models.blocks import ConvBNPReLU, DepthwiseESP, DilatedConv
 from trilitenet.models.cost import count_multiply_adds, count_parameters
+from trilitenet.models.detection import decode_level
 from trilitenet.models.segmentation import SegmentationHead
 from trilitenet.models.trilitenet import NetworkOutputs, foreign_layers, normalise_images
 from trilitenet.models.weights import import_published
@@ -138,6 +139,24 @@ def test_decode_by_hand() -> None:
     np.testing.assert_allclose(decoded[0, -1].numpy(), [48, 48, 90, 60, 0.5, 0.5], rtol=1e-6)
 
 
+def test_boxes_are_decoded_in_full_precision() -> None:
+    logits = torch.full((1, 3, 1, 1, 6), 0.3, dtype=torch.bfloat16)
+    decoded = decode_level(logits, torch.tensor([[90.0, 60.0]] * 3), 32)
+    assert decoded.dtype is torch.float32
+    sigmoid = 1 / (1 + np.exp(-float(logits[0, 0, 0, 0, 0])))
+    expected = [(2 * sigmoid - 0.5) * 32] * 2 + [4 * sigmoid**2 * 90, 4 * sigmoid**2 * 60, sigmoid, sigmoid]
+    np.testing.assert_allclose(decoded[0, 0].numpy(), expected, rtol=1e-5)
+
+
+def test_the_card_names_what_the_network_has() -> None:
+    assert build_network("tiny").card.class_names == ("vehicle",)
+    assert build_network("tiny", 2).card.class_names == ("class_0", "class_1")
+    for tasks, blocks in ((("lane",), ("pcaa",)), (("detection",), ("litepan", "spp"))):
+        network = build_network("tiny", tasks=tasks)
+        assert network.blocks == network.card.blocks == blocks
+    assert build_network("tiny", tasks="lane").tasks == ("lane",)
+
+
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_initial_objectness_is_rare(variant: str) -> None:
     network = build_network(variant, classes=2).eval()
@@ -158,7 +177,9 @@ def test_what_is_given_is_left_as_it_is() -> None:
     assert torch.equal(pixels, torch.full_like(pixels, 100.0))
     network = build_network("tiny").train()
     network.encoder.eval()
+    before = {name: value.clone() for name, value in network.state_dict().items()}
     count_multiply_adds(network, (64, 64))
+    torch.testing.assert_close(network.state_dict(), before, rtol=0, atol=0)
     assert network.training
     assert not network.encoder.training
 

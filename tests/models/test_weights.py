@@ -66,6 +66,15 @@ def test_round_trip(tmp_path: Path, classes: int, tasks: tuple[str, ...], blocks
                 assert torch.equal(got, expected)
 
 
+def test_what_is_saved_is_what_the_network_is(tmp_path: Path) -> None:
+    network = build_network("tiny")
+    network.anchors.mul_(2)  # as fitted to a data set, after the card was written
+    save_network(network, tmp_path / "net.safetensors", network.card)
+    torch.testing.assert_close(load_network(tmp_path / "net.safetensors").anchors, network.anchors)
+    names = load_file(tmp_path / "net.safetensors")
+    assert not [name for name in names if name == "anchors" or name.endswith("num_batches_tracked")]
+
+
 def test_half_precision_halves_the_file(tmp_path: Path) -> None:
     network = build_network("tiny")
     save_network(network, tmp_path / "full.safetensors", network.card)
@@ -234,8 +243,9 @@ def test_import_refuses_what_is_not_a_checkpoint(golden: dict[str, NDArray[Any]]
         "absent.pth": "does not exist",
     }
     for name, message in cases.items():
-        with pytest.raises(WeightsError, match=message):
+        with pytest.raises(WeightsError, match=message) as caught:
             import_published(tmp_path / name, tmp_path / "out.safetensors")
+        assert "it is not a TriLiteNet checkpoint" not in str(caught.value)  # most of it is there
         assert not (tmp_path / "out.safetensors").exists()
 
 
