@@ -21,11 +21,11 @@ from tests.artefacts import SIZE, Artefacts
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
 from trilitenet.errors import BackendError, ConfigError, ShapeError, WeightsError
 from trilitenet.inference.backend import Backend
-from trilitenet.inference.exported import prepare_input, read_metadata
+from trilitenet.inference.exported import is_int8_onnx, prepare_input, read_metadata
 from trilitenet.inference.ncnn_backend import NcnnBackend
 from trilitenet.inference.onnx_backend import OnnxBackend
 from trilitenet.inference.openvino_backend import OpenVINOBackend
-from trilitenet.inference.tensorrt_backend import pack_engine, unpack_engine
+from trilitenet.inference.tensorrt_backend import MAGIC, pack_engine, unpack_engine
 from trilitenet.models.weights import load_network
 
 BACKENDS = [
@@ -134,9 +134,52 @@ def test_a_predictor_goes_to_other_processes(artefacts: Artefacts, name: str, ki
     predictor = trilitenet.Predictor(kind(artefacts.folder / name, threads=1), batch_size=3)
     copy = pickle.loads(pickle.dumps(predictor))  # noqa: S301 - its own
     assert (copy.backend.name, copy.batch_size) == (predictor.backend.name, 3)
+    assert copy.backend._threads == 1
     for one, other in zip(predictor([*artefacts.images]), copy([*artefacts.images]), strict=True):
         assert one.lane is not None
         np.testing.assert_array_equal(other.lane, one.lane)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("model.onnx", OnnxBackend), ("model.xml", OpenVINOBackend), ("model.ncnn.param", NcnnBackend)],
+)
+def test_another_process_may_work_in_another_folder(
+    artefacts: Artefacts, name: str, kind: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if kind is NcnnBackend:
+        pytest.importorskip("pnnx")
+        pytest.importorskip("ncnn")
+    monkeypatch.chdir(artefacts.folder)
+    data = pickle.dumps(kind(name))
+    monkeypatch.chdir(tmp_path)
+    assert pickle.loads(data).canvas == SIZE  # noqa: S301 - its own
+
+
+def test_streams_and_precision_go_with_it(artefacts: Artefacts) -> None:
+    backend = OpenVINOBackend(artefacts.folder / "model.xml", precision="fp32", streams=2)
+    assert backend.name == "openvino cpu fp32 x2"
+    assert pickle.loads(pickle.dumps(backend)).name == backend.name  # noqa: S301 - its own
+
+
+def test_a_precision_that_the_processor_has_not_is_computed_in_fp32(
+    artefacts: Artefacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from trilitenet.inference import openvino_backend
+
+    class Core:
+        def __init__(self, core: Any) -> None:
+            self.core = core
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self.core, name)
+
+        def get_property(self, device: str, name: str) -> list[str]:
+            return ["FP32", "INT8"]
+
+    plain = openvino_backend.openvino_core
+    monkeypatch.setattr(openvino_backend, "openvino_core", lambda openvino: Core(plain(openvino)))
+    assert OpenVINOBackend(artefacts.folder / "model.xml").name == "openvino cpu fp32"
 
 
 def test_signals_may_come_after_models_were_dropped(artefacts: Artefacts) -> None:
@@ -204,8 +247,9 @@ def test_a_closed_model_says_so(artefacts: Artefacts) -> None:
 @pytest.mark.parametrize("kind", [OnnxBackend, OpenVINOBackend])
 def test_wrong_size_is_refused(artefacts: Artefacts, kind: Any) -> None:
     backend = kind(artefacts.folder / "model.onnx")
-    with pytest.raises(ShapeError, match="128x64"):
-        backend.run(np.zeros((1, 96, 128, 3), np.uint8))
+    for height in (96, 32):
+        with pytest.raises(ShapeError, match=f"takes 128x64 pixels, got 128x{height}"):
+            backend.run(np.zeros((1, height, 128, 3), np.uint8))
     with pytest.raises(ShapeError, match="uint8"):
         backend.run(np.zeros((1, 64, 128, 3), np.float32))
 
@@ -262,6 +306,10 @@ def test_openvino_without_its_weights_file(artefacts: Artefacts, tmp_path: Path)
     shutil.copy(artefacts.folder / "model.xml", tmp_path / "model.xml")
     with pytest.raises(WeightsError, match=r"its weights are missing; keep model\.bin beside it$"):
         OpenVINOBackend(tmp_path / "model.xml")
+    weights = (artefacts.folder / "model.bin").read_bytes()
+    (tmp_path / "model.bin").write_bytes(weights[: len(weights) // 2])
+    with pytest.raises(WeightsError, match=r"model\.bin is cut off, or of another file; export it again"):
+        OpenVINOBackend(tmp_path / "model.xml")
 
 
 @pytest.mark.parametrize("content", [b"", b"not a program\n" * 20, b"PK\5\6" + bytes(18)], ids=["empty", "text", "zip"])
@@ -288,6 +336,12 @@ def test_bad_options(artefacts: Artefacts) -> None:
         OpenVINOBackend(path, precision="fp8")
     with pytest.raises(BackendError, match="cuda"):
         OnnxBackend(artefacts.folder / "model.onnx", "mps")
+
+
+def test_a_runtime_without_cuda_says_so(artefacts: Artefacts, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("onnxruntime.get_available_providers", lambda: ["CPUExecutionProvider"])
+    with pytest.raises(BackendError, match=r"has no CUDA; install onnxruntime-gpu, or use device='cpu'"):
+        OnnxBackend(artefacts.folder / "model.onnx", "cuda")
 
 
 @pytest.mark.parametrize(("name", "runtime"), [("model.onnx", "onnxruntime"), ("model.xml", "openvino")])
@@ -329,9 +383,26 @@ def test_engine_files(tmp_path: Path) -> None:
     path = tmp_path / "a.engine"
     path.write_bytes(pack_engine(b"engine", card, info))
     assert unpack_engine(path) == (card, info, b"engine")
-    path.write_bytes(b"ftrt" * 20)
-    with pytest.raises(WeightsError, match="not an engine of ours"):
-        unpack_engine(path)
+    for broken in (b"ftrt" * 20, MAGIC, MAGIC + b"\x02"):
+        path.write_bytes(broken)
+        with pytest.raises(WeightsError, match="not an engine of ours"):
+            unpack_engine(path)
+    for header, message in ((b"[1]", "its header is not a JSON object"), (b"{1}", "its header is broken")):
+        path.write_bytes(MAGIC + b"\x03\0\0\0" + header)
+        with pytest.raises(WeightsError, match=message):
+            unpack_engine(path)
+
+
+def test_integers_are_told_by_what_the_artefact_says_of_itself(tmp_path: Path) -> None:
+    path = tmp_path / "a.onnx"
+    card = ModelCard("tiny", notes=('of "precision": "int8" there is more in the documentation',)).to_json()
+    for artefact, found in ((ArtefactInfo("onnx", "int8"), True), (ArtefactInfo("onnx", "fp32"), False)):
+        info = json.loads(artefact.to_json())
+        for separators in ((",", ":"), (", ", ": ")):
+            entry = f"{ARTEFACT_KEY}{json.dumps(info, separators=separators)}"
+            path.write_bytes(b"\x08" * 100_000 + f'"precision": "int8" {card} {entry}'.encode())
+            assert is_int8_onnx(path) == found
+    assert not is_int8_onnx(tmp_path / "none.onnx")
 
 
 def test_metadata_that_is_no_text() -> None:

@@ -85,6 +85,15 @@ def test_refusals(artefacts: Artefacts) -> None:
         NcnnBackend(path, precision="bf16")
 
 
+@pytest.mark.parametrize(("half", "precision"), [(True, "fp16"), (False, "fp32")])
+def test_halves_are_for_processors_that_compute_in_them(
+    artefacts: Artefacts, half: bool, precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ncnn.cpu_support_arm_asimdhp", lambda: half)
+    assert NcnnBackend(artefacts.folder / "model.ncnn.param", precision="fp16").precision == precision
+    assert NcnnBackend(artefacts.folder / "model.ncnn.param").precision == "fp32"
+
+
 @pytest.mark.parametrize("suffix", [".param", ".bin", ".json"])
 def test_a_file_that_is_missing_or_broken_is_one_line(copied: Path, suffix: str) -> None:
     file = copied.with_suffix(suffix)

@@ -109,6 +109,7 @@ def test_errors() -> None:
         Predictor(ColourBackend(), batch_size=0)
     with pytest.raises(ConfigError, match="long_side must be at most 16384, got 100000"):
         Predictor(ColourBackend(), long_side=100_000)
+    assert Predictor(ColourBackend(), long_side=16384).long_side == 16384
 
 
 def test_it_closes_its_backend() -> None:

@@ -62,6 +62,17 @@ def test_name_and_canvas(backend: TorchBackend) -> None:
 def test_sizes_that_are_no_multiple_of_32_are_refused(backend: TorchBackend) -> None:
     with pytest.raises(ShapeError, match="multiples of 32"):
         backend.run(np.zeros((1, 60, 96, 3), np.uint8))
+    with pytest.raises(ShapeError, match="multiples of 32"):
+        backend.run(np.zeros((1, 64, 90, 3), np.uint8))
+
+
+def test_too_large_a_batch_is_one_line(backend: TorchBackend, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forward(*_: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate ...")
+
+    monkeypatch.setattr(backend.network, "forward", forward)
+    with pytest.raises(BackendError, match="torch cpu is out of memory for 2 images of 96x64; use a smaller batch"):
+        backend.run(np.zeros((2, 64, 96, 3), np.uint8))
 
 
 @pytest.mark.parametrize("device", ["cuda:99", "nonsense", "meta:x"])
@@ -97,6 +108,7 @@ def test_batches_are_checked_and_left_as_they_are() -> None:
         np.zeros((1, 64, 64, 3), np.float32),
         np.zeros((64, 64, 3), np.uint8),
         np.zeros((0, 64, 64, 3), np.uint8),
+        np.zeros((1, 64, 0, 3), np.uint8),
     ):
         with pytest.raises(ShapeError, match="a batch must be"):
             backend.run(batch)  # type: ignore[arg-type]
