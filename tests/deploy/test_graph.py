@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from tests.deploy.networks import lively_network
-from trilitenet.config import STRIDES, Thresholds
-from trilitenet.deploy.graph import AttentionGraph, DeployGraph
+from trilitenet.config import STRIDES, ArtefactInfo, Thresholds
+from trilitenet.deploy.graph import AttentionGraph, DeployGraph, Traceable
 from trilitenet.deploy.layers import Layout
 from trilitenet.deploy.layouts import LAYOUTS
 from trilitenet.errors import ConfigError, ShapeError
@@ -143,12 +143,48 @@ def test_thresholds_and_probabilities() -> None:
     with torch.inference_mode():
         probability = DeployGraph(network, masks="probability")(images).lane
         strict = DeployGraph(network, thresholds=Thresholds(lane=0.51))(images).lane
+        other = DeployGraph(network, masks="probability", thresholds=Thresholds(lane=0.9))(images).lane
         outputs = network(normalise_images(images.permute(0, 3, 1, 2)))
     assert probability is not None
     assert strict is not None
     wanted = outputs.lane.softmax(1)[:, 1]
     assert (probability.float() - wanted * 255).abs().max() <= 0.51
     assert ((strict == 1) == (wanted > 0.51)).float().mean() > 0.9999
+    assert torch.equal(probability, other)
+
+
+def test_each_task_has_the_threshold_of_the_card() -> None:
+    network = lively_network()
+    images = torch.randint(0, 256, (1, 64, 128, 3), dtype=torch.uint8)
+    with torch.inference_mode():
+        outputs = network(normalise_images(images.permute(0, 3, 1, 2)))
+        shares = {task: getattr(outputs, task).softmax(1)[:, 1] for task in ("drivable", "lane")}
+        middle = {task: float(share.quantile(at)) for (task, share), at in zip(shares.items(), (0.3, 0.7), strict=True)}
+        network.card = dataclasses.replace(
+            network.card, thresholds=Thresholds(drivable=middle["drivable"], lane=middle["lane"])
+        )
+        decided = DeployGraph(network)(images)
+    for task, share in shares.items():
+        assert ((getattr(decided, task) == 1) == (share > middle[task])).float().mean() > 0.999
+
+
+def test_boxes_are_decoded_in_full_precision() -> None:
+    network = lively_network(tasks=("detection",))
+    full, reduced = DeployGraph(network).detection, DeployGraph(network).reduced(torch.bfloat16).detection
+    assert full is not None
+    assert reduced is not None
+    logits = torch.randn(1, 3 * 6, 2, 4).to(torch.bfloat16)
+    torch.testing.assert_close(reduced.decode(1, logits), full.decode(1, logits.float()), rtol=0, atol=0)
+
+
+def test_sizes_of_a_program_are_multiples_of_32_to_4096() -> None:
+    network = lively_network(tasks=("lane",))
+    graph = DeployGraph(network, LAYOUTS["pixels"])
+    for form, axes in (("uint8_nhwc", [1, 2]), ("float_nchw", [2, 3])):
+        sizes = Traceable(graph, network.card, ArtefactInfo("torch", size=None, input=form)).dynamic  # type: ignore[arg-type]
+        assert sizes is not None
+        assert list(sizes[0]) == axes
+        assert {(side.root.min, side.root.max, side.fn(3)) for side in sizes[0].values()} == {(2, 128, 96)}
 
 
 def test_portable_input() -> None:
@@ -165,6 +201,10 @@ def test_wrong_options_and_shapes() -> None:
     network = lively_network(tasks=("lane",))
     with pytest.raises(ConfigError, match="mask_scale"):
         DeployGraph(network, masks="probability", mask_scale=2)
+    with pytest.raises(ConfigError, match="mask_scale"):
+        DeployGraph(network, masks="logit", mask_scale=2)
+    with pytest.raises(ConfigError, match=r"to float16 or bfloat16, not torch\.float32"):
+        DeployGraph(network).reduced(torch.float32)
     with pytest.raises(ConfigError, match="unknown masks"):
         DeployGraph(network, masks="soft")  # type: ignore[arg-type]
     with pytest.raises(ShapeError, match="uint8"):

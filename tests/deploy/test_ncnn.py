@@ -92,10 +92,15 @@ def test_a_layout_beyond_ncnn_is_one_line() -> None:
 def test_pnnx_that_fails_or_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     network = lively_network(tasks=("lane",))
     broken = tmp_path / "pnnx"
-    broken.write_text("#!/bin/sh\necho first >&2\necho out of order >&2\nexit 3\n", encoding="utf-8")
+    script = "touch graph.ncnn.param graph.ncnn.bin\necho first >&2\necho out of order >&2\nexit 3\n"
+    broken.write_text(f"#!/bin/sh\n{script}", encoding="utf-8")
     broken.chmod(0o755)
     monkeypatch.setattr(pnnx, "EXEC_PATH", str(broken))
     with pytest.raises(BackendError, match="exit status 3: out of order"):
+        build(network)
+    script = "echo 7767518 > graph.ncnn.param\necho 0 0 >> graph.ncnn.param\ntouch graph.ncnn.bin\n"
+    broken.write_text(f"#!/bin/sh\n{script}", encoding="utf-8")
+    with pytest.raises(BackendError, match="of another layout"):
         build(network)
     monkeypatch.setattr(pnnx, "EXEC_PATH", str(tmp_path / "nothing"))
     with pytest.raises(BackendError, match="pnnx does not run here"):

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from tests.artefacts import SIZE, Artefacts
 from tests.deploy.networks import lively_network
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, Thresholds
 from trilitenet.deploy import onnx as deploy_onnx
+from trilitenet.deploy import quantize
 from trilitenet.deploy.graph import DeployGraph
 from trilitenet.deploy.layouts import LAYOUTS, pick_layout
 from trilitenet.deploy.onnx import PORTABLE_OPERATORS, build_onnx, save_onnx
@@ -32,6 +34,9 @@ def test_a_program_that_is_not_ours_accepts_it(artefacts: Artefacts) -> None:
     assert len(set(names)) == len(names)
     assert any(name.startswith("lane/up2/conv1/Conv") for name in names)
     assert str(Path(__file__).parent) not in str(model)
+    noted = [*model.graph.node, *model.graph.input, *model.graph.output, *model.graph.value_info]
+    assert not [part.name for part in noted if part.metadata_props]  # the exporter writes stack traces there
+    assert (model.producer_name, model.producer_version) == ("trilitenet", "0")
 
 
 def test_suppression_inside_keeps_what_suppression_outside_keeps(tmp_path: Path) -> None:
@@ -96,8 +101,31 @@ def test_what_cannot_be_traced_is_one_plain_line(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(torch.onnx, "export", fail)
     network = lively_network()
+    talkers = [logging.getLogger(name) for name in ("torch.onnx", "onnx_ir")]
+    levels = [talker.level for talker in talkers]
     with pytest.raises(BackendError, match=r"\(Expected shape\[1\] = 360 to be of the form 32\*rows\)$"):
         build_onnx(DeployGraph(network, LAYOUTS["vectors-tiny"]), network.card, ArtefactInfo("onnx"))
+    assert [talker.level for talker in talkers] == levels
+
+
+def test_large_weights_are_stored_by_half() -> None:
+    import onnxruntime
+
+    helper = onnx.helper
+    x = helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1, 64])
+    y = helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, [1, 63])
+    matrix = np.random.default_rng(0).random((64, 63), np.float32)
+    small = np.full(63, 1 / 3, np.float32)
+    weights = [onnx.numpy_helper.from_array(matrix, "matrix"), onnx.numpy_helper.from_array(small, "small")]
+    nodes = [helper.make_node("MatMul", ["x", "matrix"], ["z"]), helper.make_node("Add", ["z", "small"], ["y"])]
+    graph = helper.make_graph(nodes, "g", [x], [y], weights)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    deploy_onnx._store_half(onnx, model)
+    onnx.checker.check_model(model, full_check=True)
+    kinds = {entry.name: entry.data_type for entry in model.graph.initializer}
+    assert kinds == {"small": onnx.TensorProto.FLOAT, "matrix_fp16": onnx.TensorProto.FLOAT16}
+    (got,) = onnxruntime.InferenceSession(model.SerializeToString()).run(None, {"x": np.ones((1, 64), np.float32)})
+    np.testing.assert_allclose(got[0], matrix.astype(np.float16).astype(np.float32).sum(0) + small, rtol=1e-5)
 
 
 def test_layouts_are_picked() -> None:
@@ -105,7 +133,9 @@ def test_layouts_are_picked() -> None:
     assert pick_layout("auto", "base", "openvino", unit="avx512") == LAYOUTS["vectors-base"]
     assert pick_layout("auto", "tiny", "openvino", unit="other") == LAYOUTS["vectors-small"]
     assert pick_layout("auto", "base", "cuda") == LAYOUTS["pixels"]
-    assert not pick_layout("auto", "tiny", "onnxruntime").channels_last
+    assert pick_layout("auto", "tiny", "onnxruntime") == LAYOUTS["planar-maximum-heads"]
+    assert pick_layout("auto", "base", "onnxruntime") == LAYOUTS["planar-maximum-split"]
+    assert pick_layout("auto", "tiny", "planar") == LAYOUTS["planar"]
     with pytest.raises(ConfigError, match="did you mean 'pixels'"):
         pick_layout("pixel", "tiny", "openvino")
 
@@ -115,11 +145,22 @@ def test_kept_nodes_follow_modules() -> None:
     assert kept_nodes(names, KEEP_STEPS[0]) == []
     assert kept_nodes(names, KEEP_STEPS[1]) == ["detection/heads/0/Conv_4"]
     assert set(kept_nodes(names, KEEP_STEPS[3])) == set(names)
+    assert kept_nodes(["pcaa/merge2/Conv_1", "stem2/Conv_2"], KEEP_STEPS[4]) == []  # whole names of modules
+
+
+def test_quantisers_are_quiet_and_others_heard_again(caplog: pytest.LogCaptureFixture) -> None:
+    log = logging.getLogger("somebody")
+    with quantize._quiet():
+        log.warning("of the quantiser")
+    log.warning("of others")
+    assert caplog.messages == ["of others"]
 
 
 def test_trtexec_line() -> None:
     line = trtexec_line(Path("a b.onnx"), Path("a.plan"), "fp16")
     assert line == "trtexec '--onnx=a b.onnx' --saveEngine=a.plan --fp16 --useCudaGraph"
+    assert trtexec_line(Path("a"), Path("b"), "bf16") == "trtexec --onnx=a --saveEngine=b --bf16 --useCudaGraph"
+    assert trtexec_line(Path("a"), Path("b"), "fp32") == "trtexec --onnx=a --saveEngine=b --useCudaGraph"
 
 
 @pytest.mark.parametrize(("classes", "most"), [(1, 300), (80, 300), (80, 25)])
@@ -141,6 +182,9 @@ def test_suppression_inside_is_exact_for_any_number_of_classes(classes: int, mos
     thresholds = Thresholds(confidence=0.4, iou=0.4, max_boxes=most)
     deploy_onnx._append_nms(onnx, model, classes, thresholds)
     onnx.checker.check_model(model, full_check=True)
+    (output,) = model.graph.output
+    shape = [axis.dim_param or axis.dim_value for axis in output.type.tensor_type.shape.dim]
+    assert shape == [1, "kept", 5 + classes]
     (inside,) = onnxruntime.InferenceSession(model.SerializeToString()).run(None, {"rows": rows})
     confidence, class_id = rows[0, :, 4] * rows[0, :, 5:].max(1), rows[0, :, 5:].argmax(1)
     likely = (confidence > 0.4).nonzero()[0]

@@ -26,6 +26,35 @@ def test_what_cannot_be_written_is_told_in_one_line(tmp_path: Path) -> None:
         save_openvino(model, tmp_path / "a.xml", ModelCard("tiny"), ArtefactInfo("openvino"))
 
 
+@pytest.mark.parametrize(("precision", "bytes_each"), [("fp32", 4), ("bf16", 4), ("fp16", 2)])
+def test_weights_of_fp16_are_stored_as_such(tmp_path: Path, precision: Any, bytes_each: int) -> None:
+    image = openvino.opset13.parameter([1, 1000], np.float32)
+    matrix = openvino.opset13.constant(np.random.default_rng(0).random((1000, 50), np.float32))
+    model = openvino.Model([openvino.opset13.matmul(image, matrix, False, False)], [image], "a")
+    save_openvino(model, tmp_path / "a.xml", ModelCard("tiny"), ArtefactInfo("openvino", precision))
+    assert (tmp_path / "a.bin").stat().st_size == pytest.approx(50_000 * bytes_each, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("flags", "unit"),
+    [
+        ("avx2 avx512f avx512_vnni amx_bf16 amx_int8", "amx"),
+        ("avx2 avx512f amx_int8", "avx512"),
+        ("avx2 avx512f", "avx512"),
+        ("avx avx2", "other"),
+        (None, "other"),
+    ],
+)
+def test_what_the_processor_multiplies_with(flags: str | None, unit: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def read_text(path: Path, encoding: str) -> str:
+        if flags is None:
+            raise FileNotFoundError(path)
+        return f"model name : x\nflags : fpu {flags}\nbugs :\n"
+
+    monkeypatch.setattr(Path, "read_text", read_text)
+    assert vector_unit() == unit
+
+
 @pytest.mark.parametrize("variant", ["tiny", "base"])
 def test_cells_of_columns_are_views(variant: str) -> None:
     """Outside the attention, which regroups bins, nothing is copied to be laid out anew."""

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from trilitenet.deploy.parity import Tolerance, compare
+from trilitenet.deploy.parity import Parity, Tolerance, compare
 from trilitenet.structures import RawOutputs
 
 STRICT = Tolerance(pixels=0.999, boxes=0.99, confidence=0.02)
@@ -116,3 +116,63 @@ def test_a_speck_must_be_at_its_place_to_half_a_pixel() -> None:
     ]
     shares = [compare(lambda _: specks[0], lambda _, one=one: one, [CANVAS], STRICT).boxes for one in specks]  # type: ignore[misc]
     assert shares == [1.0, 1.0, 0.0]
+
+
+def of_boxes(*rows: tuple[float, ...]) -> RawOutputs:
+    """Boxes as (centre x, centre y, width, height, objectness), surely of the one class."""
+    return RawOutputs(np.array([[[*row, 1.0] for row in rows]], np.float32), None, None)
+
+
+def compared(one: RawOutputs, other: RawOutputs, confidence: float = 0.25) -> Parity:
+    return compare(lambda _: one, lambda _: other, [CANVAS], STRICT, confidence=confidence)
+
+
+def test_a_box_must_overlap_by_nine_tenths() -> None:
+    box = of_boxes((30, 15, 16, 10, 0.9))
+    assert compared(box, of_boxes((30.8, 15, 16, 10, 0.9))).boxes == 1.0  # IoU 15.2 / 16.8 = 0.905
+    assert compared(box, of_boxes((31, 15, 16, 10, 0.9))).boxes == 0.0  # IoU 15 / 17 = 0.882
+
+
+def test_every_side_of_a_speck_counts() -> None:
+    wider = of_boxes((20.4, 15, 1.8, 1, 0.9))  # of its sides only the right one is elsewhere, by 0.8 pixels
+    assert compared(of_boxes((20, 15, 1, 1, 0.9)), wider).boxes == 0.0
+
+
+def test_how_far_sides_are_apart_is_of_the_pairs() -> None:
+    one = of_boxes((20, 15, 0.2, 0.2, 0.9), (50, 15, 0.2, 0.2, 0.9))
+    found = compared(one, of_boxes((20, 15, 0.2, 0.2, 0.9), (50.25, 15, 0.2, 0.2, 0.9)))
+    assert found.boxes == 1.0
+    assert found.box_error == pytest.approx(0.0625)  # of four sides left and right are 0.25 apart, of every other pair
+
+
+def test_boxes_without_a_pair_are_told() -> None:
+    found = compared(of_boxes((20, 15, 16, 10, 0.9)), of_boxes((40, 15, 16, 10, 0.9)))
+    assert found.summary() == "parity: 1 frames, boxes in both 0.0000 (sides 0.00 px apart)"
+
+
+def test_the_less_confident_boxes_are_looked_for_too() -> None:
+    boxes = [(10 * i, 15, 8, 10, 0.9 - i / 100) for i in range(1, 6)]
+    found = compared(of_boxes(*boxes), of_boxes(*boxes[:4], (55, 15, 8, 10, 0.85)))
+    assert found.boxes == 8 / 10
+
+
+def test_boxes_barely_above_the_threshold_are_compared() -> None:
+    barely = of_boxes((20, 15, 16, 10, 0.27))
+    assert compared(barely, barely, confidence=0.25).boxes == 1.0
+
+
+def test_boxes_at_half_of_the_best_are_left_to_rounding() -> None:
+    best = (20, 15, 16, 10, 0.2)
+    found = compared(of_boxes(best, (50, 15, 8, 8, 0.101)), of_boxes(best, (50, 15, 8, 8, 0.099)), confidence=0.25)
+    assert found.boxes == 1.0
+
+
+def test_boxes_that_are_no_numbers_fail() -> None:
+    broken = of_boxes((float("nan"),) * 5)
+    assert compared(of_boxes((20, 15, 16, 10, 0.9)), broken).boxes == 0.0
+
+
+def test_what_is_just_within_the_tolerance_passes() -> None:
+    just = Parity(1, 0.999, 0.99, 0.0, STRICT, detection=True)
+    assert just.failures == []
+    assert len(Parity(1, 0.9989, 0.9899, 0.0, STRICT, detection=True).failures) == 2

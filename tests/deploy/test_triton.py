@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from trilitenet.config import ModelCard
-from trilitenet.deploy.triton import write_triton_repository
+from trilitenet.deploy.triton import read_tensors, write_triton_repository
 from trilitenet.errors import OutputError, WeightsError
 
 onnx = pytest.importorskip("onnx")
@@ -36,7 +36,8 @@ def _artefact(path: Path) -> Path:
     boxes = helper.make_tensor_value_info("detection", onnx.TensorProto.FLOAT, [1, "candidates", 6])
     weight = helper.make_tensor("weight", onnx.TensorProto.FLOAT, [1, 1, 6], np.zeros(6, np.float32))
     nodes = [helper.make_node("Identity", ["image"], ["lane"]), helper.make_node("Identity", ["weight"], ["detection"])]
-    graph = helper.make_graph(nodes, "network", [image], [boxes, lane], [weight])
+    listed = helper.make_tensor_value_info("weight", onnx.TensorProto.FLOAT, [1, 1, 6])  # as older graphs do
+    graph = helper.make_graph(nodes, "network", [image, listed], [boxes, lane], [weight])
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9), path)
     return path
 
@@ -73,6 +74,17 @@ def test_a_model_is_replaced_whole(tmp_path: Path) -> None:
     assert write_triton_repository(artefact, repository, ModelCard("base"), name="mine", overwrite=True) == model
     assert [path.name for path in sorted(model.rglob("*"))] == ["1", "model.onnx", "config.pbtxt"]
     assert [path.name for path in repository.iterdir()] == ["mine"]
+
+
+def test_types_are_named_as_triton_names_them(tmp_path: Path) -> None:
+    helper, kinds = onnx.helper, {"FLOAT16": "FP16", "BOOL": "BOOL", "INT64": "INT64", "DOUBLE": "FP64"}
+    values = [helper.make_tensor_value_info(kind, getattr(onnx.TensorProto, kind), [1]) for kind in kinds]
+    outputs = [helper.make_tensor_value_info(f"{kind}2", getattr(onnx.TensorProto, kind), [1]) for kind in kinds]
+    nodes = [helper.make_node("Identity", [kind], [f"{kind}2"]) for kind in kinds]
+    model = helper.make_model(helper.make_graph(nodes, "g", values, outputs), ir_version=9)
+    onnx.save(model, tmp_path / "a.onnx")
+    inputs, made = read_tensors(tmp_path / "a.onnx")
+    assert [one.datatype for one in inputs] == [one.datatype for one in made] == list(kinds.values())
 
 
 def test_a_broken_graph_is_named(tmp_path: Path) -> None:
