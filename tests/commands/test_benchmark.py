@@ -158,3 +158,79 @@ def test_a_ratio_above_1_is_faster_than_the_first(monkeypatch: pytest.MonkeyPatc
     first, second = benchmark("0.1", "0.01", rounds=3, warmup=0, size=(32, 64)).timings
     assert first.ratio == 1
     assert second.ratio > 2
+
+
+class Watch:
+    """A clock that stands still but for what the backend below takes."""
+
+    def __init__(self) -> None:
+        self.now = 50.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class Taking(ColourBackend):
+    """A backend that takes so many milliseconds, one time after the other."""
+
+    def __init__(self, watch: Watch, milliseconds: list[int]) -> None:
+        super().__init__()
+        self.watch, self.milliseconds = watch, milliseconds
+        self.runs = 0
+
+    def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
+        self.watch.now += self.milliseconds[self.runs] / 1e3
+        self.runs += 1
+        return super().run(batch)
+
+
+@pytest.fixture
+def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
+    watch = Watch()
+    monkeypatch.setattr("trilitenet.commands.benchmark.time.perf_counter", watch)
+    return watch
+
+
+def test_figures_by_hand(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
+    backend = Taking(watch, [700, 9000, 9000, *range(100, 201)])  # the first, two to warm up, 100 to 200 ms
+
+    def load(model: str, **_: object) -> Predictor:
+        watch.now += 2.0
+        return Predictor(backend)
+
+    joules = iter(0.5 * count for count in range(1000))  # half a joule each time
+
+    monkeypatch.setattr("trilitenet.commands.benchmark.load", load)
+    monkeypatch.setattr("trilitenet.commands.benchmark._Meter.read", lambda meter: next(joules))
+    (row,) = benchmark("a", batch=(2,), rounds=101, warmup=2, size=(32, 64)).timings
+    assert backend.runs == 1 + 2 + 101
+    assert (row.p50, row.p90, row.p99) == pytest.approx((150, 190, 199))
+    assert row.frames_per_second == pytest.approx(2 / 0.15)
+    assert row.first_result == pytest.approx(2.7)
+    assert row.joules == 0.25
+    assert row.watts == pytest.approx(0.5 / 0.15)
+
+
+def test_the_first_result_is_that_of_the_first_call(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
+    backend = Taking(watch, [700, 10, 10, 10])
+    monkeypatch.setattr("trilitenet.commands.benchmark.load", lambda model, **_: Predictor(backend))
+    rows = benchmark("a", batch=(1, 2), rounds=1, warmup=0, size=(32, 64)).timings
+    assert [row.first_result for row in rows] == pytest.approx([0.7, 0.7])
+
+
+def test_energy_is_told_only_where_it_was_read_each_time(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trilitenet.commands.benchmark.load", lambda model, **_: Predictor(Taking(watch, [10] * 10)))
+    for readings in ([1.0, 2.0, 3.0, 0.5], [1.0, 2.0, None, None]):  # the counter began anew; it is gone
+        left = iter(readings)
+        monkeypatch.setattr("trilitenet.commands.benchmark._Meter.read", lambda meter, left=left: next(left))
+        result = benchmark("a", rounds=2, warmup=0, size=(32, 64))
+        assert (result.timings[0].joules, result.timings[0].watts) == (None, None)
+        assert "| - | - |" in result.summary()
+
+
+def test_memory_is_told_in_bytes(artefacts: Artefacts, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    result = benchmark(str(artefacts.folder / "model.xml"), rounds=1, warmup=0, plot=tmp_path / "a.PNG")
+    assert result.peak_memory is not None
+    assert 2**26 < result.peak_memory < 2**40
+    assert (tmp_path / "a.PNG").is_file()

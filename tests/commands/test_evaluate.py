@@ -13,7 +13,8 @@ import pytest
 from tests.artefacts import Artefacts
 from trilitenet.apps.cli import main
 from trilitenet.commands.compare import compare
-from trilitenet.commands.evaluate import evaluate, hash_dataset, hash_model
+from trilitenet.commands.evaluate import _resized, check_output, evaluate, hash_dataset, hash_model
+from trilitenet.commands.load import load
 from trilitenet.commands.score import score
 from trilitenet.config import ARTEFACT_KEY, ModelCard
 from trilitenet.data.reading import DrivingDataset
@@ -94,6 +95,10 @@ def test_the_weights_beside_a_graph_are_part_of_its_hash(tmp_path: Path) -> None
         before = hash_model(str(path))
         path.with_suffix(".bin").write_bytes(b"others")
         assert hash_model(str(path)) not in (before, None)
+    before = hash_model(str(tmp_path))
+    (tmp_path / "a.ncnn.bin").write_bytes(b"yet others")
+    assert hash_model(str(tmp_path)) not in (before, None)
+    assert hash_model(str(tmp_path / "none.onnx")) is None
 
 
 def test_a_confidence_out_of_range_is_refused(data: Path, tmp_path: Path) -> None:
@@ -125,6 +130,14 @@ def test_reports_are_not_overwritten_unasked(run: tuple[Report, Path], data: Pat
         evaluate(str(weights), data=data, save=folder / "predictions")
     with pytest.raises(OutputError, match="--overwrite"):
         score(folder / "predictions", data=data, output=folder)
+    check_output(folder, overwrite=True)
+
+
+def test_each_size_is_measured_at_itself(weights: Path) -> None:
+    with load(weights, device="cpu", lane=0.3) as predictor:
+        sized = _resized(predictor, (96, 160))
+    assert {side: one.long_side for side, one in sized.items()} == {96: 96, 160: 160}  # type: ignore[attr-defined]
+    assert sized[96].thresholds.lane == 0.3
 
 
 def test_sizes_and_corruptions_are_measured_too(data: Path, weights: Path) -> None:

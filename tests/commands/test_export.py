@@ -18,10 +18,11 @@ import trilitenet
 from tests.artefacts import Artefacts
 from trilitenet.commands import export as command
 from trilitenet.commands.export import export, find_pictures
-from trilitenet.config import TASKS
+from trilitenet.config import TASKS, ArtefactInfo
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.synthetic_files import write_dataset
 from trilitenet.deploy.parity import TOLERANCES, Tolerance
+from trilitenet.deploy.quantize import KEEP_STEPS
 from trilitenet.engine.evaluate import evaluate
 from trilitenet.engine.figures import FIGURES
 from trilitenet.engine.report import Figure, Report
@@ -63,6 +64,7 @@ def test_options_that_do_not_fit(artefacts: Artefacts, tmp_path: Path) -> None:
         ({"precision": "int8", "calibration": tmp_path, "max_drop": 1.0, "nms": True}, "that --nms drops"),
         ({"format": "tensorrt", "precision": "int8"}, "tensorrt artefacts come as fp32, fp16, bf16, not int8"),
         ({"max_drop": 0.5}, "--max-drop"),
+        ({"precision": "int8", "calibration": tmp_path, "size": "dynamic"}, "int8 needs a fixed --size"),
         ({"format": "ncnn", "precision": "bf16"}, "ncnn artefacts come as fp32, fp16, not bf16"),
         ({"format": "ncnn", "size": "dynamic"}, "ncnn needs a fixed --size"),
         ({"format": "ncnn", "output": tmp_path / "a.param"}, "end with .ncnn.param"),
@@ -247,6 +249,7 @@ def test_openvino_with_synthetic_frames(artefacts: Artefacts, tmp_path: Path) ->
     assert done.parity is not None
     assert done.parity.pixels is not None
     assert done.parity.pixels > 0.9999
+    assert done.parity.frames == 4
     assert sorted(file.name for file in path.parent.iterdir()) == ["model.bin", "model.xml"]
     with trilitenet.load(path) as predictor:
         assert predictor.card.licence == "MIT"
@@ -323,6 +326,22 @@ def _int8_weights(path: Path) -> list[int]:
     return [int(np.abs(tensor.astype(int)).max()) for tensor in tensors]
 
 
+def _check_quantisers(path: Path) -> None:
+    """Activations are symmetric around 128, weights have a scale a channel, depthwise convolutions are left alone."""
+    onnx = pytest.importorskip("onnx")
+    graph = onnx.load(path).graph
+    values = {entry.name: onnx.numpy_helper.to_array(entry) for entry in graph.initializer}
+    zeros = {int(values[node.input[2]]) for node in graph.node if node.op_type == "QuantizeLinear"}
+    assert zeros == {128}
+    from_integers = {node.output[0]: node for node in graph.node if node.op_type == "DequantizeLinear"}
+    for node in graph.node:
+        grouped = [attribute.i for attribute in node.attribute if attribute.name == "group" and attribute.i > 1]
+        if node.op_type == "Conv" and node.input[1] in from_integers:
+            assert not grouped
+            scales, weight = (values[from_integers[node.input[1]].input[place]] for place in (1, 0))
+            assert scales.shape == (len(weight),)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("format_", ["openvino", "onnx"])
 def test_int8(
@@ -344,12 +363,73 @@ def test_int8(
     text = path.read_bytes()
     assert (b"FakeQuantize" if format_ == "openvino" else b"QuantizeLinear") in text
     assert max(_int8_weights(path)) <= 64  # more would overflow where the processor lacks VNNI
+    if format_ == "onnx":
+        _check_quantisers(path)
     assert "in floating point: difference, detection, c5" in done.summary()
     with trilitenet.load(path, threads=1) as predictor:  # on the runtime that it was quantised for and compared on
         assert predictor.backend.name == f"{'openvino' if format_ == 'openvino' else 'onnxruntime'} cpu int8"
     if format_ == "onnx":
         with pytest.raises(BackendError, match="use backend='onnxruntime'"):
             trilitenet.load(path, backend="openvino")
+
+
+@pytest.mark.parametrize(
+    ("max_drop", "drops", "step", "notes"),
+    [
+        (None, [], 1, ("in floating point: difference, detection, c5",)),
+        (
+            1.0,
+            [3.0, 1.0],
+            1,
+            ("in floating point: difference, detection, c5", "largest drop on val: 1.00 points"),
+        ),
+        (
+            1.0,
+            [0.5],
+            0,
+            (
+                "in floating point: attention and depthwise convolutions only",
+                "largest drop on val: 0.50 points",
+            ),
+        ),
+        (1.0, [9.0] * 5, None, ()),
+    ],
+)
+def test_int8_keeps_as_little_in_floating_point_as_the_scores_allow(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    max_drop: float | None,
+    drops: list[float],
+    step: int | None,
+    notes: tuple[str, ...],
+) -> None:
+    for split, count in (("train", 3), ("val", 1)):
+        write_dataset(tmp_path / "data", split, count, 0, size=(32, 64))
+    calls: list[tuple[int, tuple[str, ...]]] = []
+    left = iter(drops)
+
+    class Drop:
+        def __init__(self, *_: object) -> None: ...
+
+        def measure(self, backend: object) -> float:
+            return next(left)
+
+    monkeypatch.setattr(command, "quantize_onnx", lambda built, inputs, keep: calls.append((len(inputs), tuple(keep))))
+    monkeypatch.setattr(command, "_Drop", Drop)
+    monkeypatch.setattr(command, "_write", lambda *_: None)
+    monkeypatch.setattr(command, "_open", lambda *_: None)
+    monkeypatch.setattr(
+        command, "_keep", lambda _network, _built, info, path, _checks: command.Exported(path, info, None)
+    )
+    info = ArtefactInfo("onnx", "int8", (32, 64))
+    arguments: tuple[Any, ...] = (None, None, info, tmp_path / "a.onnx", [], tmp_path / "data", 500, max_drop)
+    if step is None:
+        with pytest.raises(BackendError, match=r"INT8 costs too much .*\(9\.00 points lost, at most 1\.0 allowed\)"):
+            command._export_int8(*arguments)
+        assert [keep for _, keep in calls] == list(KEEP_STEPS)
+    else:
+        assert command._export_int8(*arguments).notes == notes
+        assert calls[-1] == (3, KEEP_STEPS[step])  # on the training split
 
 
 def test_suppression_inside_is_not_overridden_silently(artefacts: Artefacts, tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import importlib.util
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +9,11 @@ import pytest
 import torch
 
 import trilitenet
-from tests.artefacts import Artefacts
+from tests.artefacts import SIZE, Artefacts
+from tests.fakes import ColourBackend
 from trilitenet.config import Thresholds
 from trilitenet.errors import BackendError, ConfigError, WeightsError
+from trilitenet.inference.openvino_backend import OpenVINOBackend
 from trilitenet.models.trilitenet import build_network
 from trilitenet.models.weights import save_network
 
@@ -33,6 +37,43 @@ def test_load_gives_a_predictor(weights: Path) -> None:
 def test_thresholds_can_be_overridden_one_by_one(weights: Path) -> None:
     predictor = trilitenet.load(weights, device="cpu", confidence=0.7, lane=0.2)
     assert predictor.thresholds == Thresholds(confidence=0.7, lane=0.2)
+    predictor = trilitenet.load(weights, device="cpu", confidence=0.0, iou=0.0, batch_size=3)
+    assert predictor.thresholds == Thresholds(confidence=0.0, iou=0.0)
+    assert predictor.batch_size == 3
+
+
+def test_a_model_whose_thresholds_are_refused_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    backend = ColourBackend()
+    monkeypatch.setattr("trilitenet.commands.load._open", lambda *_: backend)
+    with pytest.raises(ConfigError, match="confidence must be between 0 and 1"):
+        trilitenet.load("a.onnx", confidence=7)
+    assert backend.closed == 1
+
+
+def test_the_runtime_that_is_there_is_taken(artefacts: Artefacts, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = importlib.util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "openvino" else plain(name))
+    assert trilitenet.load(artefacts.folder / "model.onnx").backend.name == "onnxruntime cpu fp32"
+
+
+def test_endings_may_be_in_capitals(artefacts: Artefacts, tmp_path: Path) -> None:
+    shutil.copy(artefacts.folder / "model.onnx", tmp_path / "MODEL.ONNX")
+    assert trilitenet.load(tmp_path / "MODEL.ONNX", threads=1).backend.canvas == SIZE
+
+
+def test_a_folder_called_like_a_model_is_not_taken_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "tiny").mkdir()
+    (tmp_path / "tiny" / "a.param").touch()
+    monkeypatch.chdir(tmp_path)
+    assert trilitenet.load("tiny", device="cpu").backend.name == "torch cpu"
+
+
+def test_what_is_asked_of_openvino_reaches_it(artefacts: Artefacts) -> None:
+    backend = trilitenet.load(artefacts.folder / "model.xml", threads=1, streams=2).backend
+    assert isinstance(backend, OpenVINOBackend)
+    assert (backend._threads, backend.streams) == (1, 2)
+    with pytest.raises(ConfigError, match=r"model\.xml runs on openvino, not on torch$"):
+        trilitenet.load(artefacts.folder / "model.xml", backend="torch")
 
 
 def test_masks_that_are_decided_inside_take_no_thresholds(artefacts: Artefacts) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import pytest
 
 import trilitenet
 from trilitenet.commands.evaluate import check_output
-from trilitenet.commands.paths import text_paths
+from trilitenet.commands.paths import check_writable, text_paths
 from trilitenet.errors import ConfigError, DataError, OutputError, TriLiteNetError
 
 
@@ -88,3 +89,20 @@ def test_a_report_that_cannot_be_written_is_told_before_the_work(tmp_path: Path)
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="cannot be written"):
         check_output(tmp_path / "file" / "report", overwrite=True)
+
+
+def test_what_can_be_written_is_told_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    check_writable(tmp_path / "folders" / "to be made" / "a.json")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(OutputError, match=r"cannot be written \(it is a folder\)"):
+        check_writable(tmp_path)
+    asked: list[int] = []
+
+    def access(folder: Path, mode: int) -> bool:
+        asked.append(mode)
+        return False
+
+    monkeypatch.setattr("os.access", access)
+    with pytest.raises(OutputError, match=f"no permission to write in {tmp_path}"):
+        check_writable(tmp_path / "a.json")
+    assert asked == [os.W_OK | os.X_OK]
