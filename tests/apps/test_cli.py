@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ def greet(monkeypatch: pytest.MonkeyPatch) -> list[object]:
 
     class Done:
         exit_code = 1
+        errors = ("the other one: has gone",)
 
         def summary(self) -> str:
             return "1 of 2 greeted"
@@ -59,7 +61,7 @@ def test_a_lone_hyphen_is_standard_input(greet: list[object]) -> None:
 
 def test_a_result_is_shown_and_decides_the_exit_code(greet: list[object], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["greet", "two"]) == 1
-    assert capsys.readouterr().out == "1 of 2 greeted\n"
+    assert capsys.readouterr() == ("1 of 2 greeted\n", "error: the other one: has gone\n")
 
 
 def test_an_error_is_one_line(greet: list[object], capsys: pytest.CaptureFixture[str]) -> None:
@@ -100,6 +102,33 @@ def test_a_program_that_goes_on_handles_signals_as_before(
 ) -> None:
     assert cli.main(["greet", name]) == code
     assert {number: signal.getsignal(number) for number in handlers} == handlers
+
+
+def test_a_job_in_the_background_goes_on_at_ctrl_c(
+    greet: list[object], capsys: pytest.CaptureFixture[str], handlers: dict[signal.Signals, Any]
+) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell starts it
+    assert cli.main(["greet", "ctrl-c"]) == 0
+    assert capsys.readouterr().out == "hello ctrl-c\n"
+    assert greet == [("ctrl-c", 1), "not reached"]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there are no forks")
+def test_a_fork_ends_at_once_at_sigterm() -> None:
+    code = (
+        "import os, signal\n"
+        "from trilitenet.apps import cli\n"
+        "with cli._interruptible(ends=True):\n"
+        "    child = os.fork()\n"
+        "    if not child:\n"
+        "        try:\n"
+        "            signal.raise_signal(signal.SIGTERM)\n"
+        "        finally:\n"
+        "            os._exit(1)\n"
+        "    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stdout == "143\n"
 
 
 _NO_INT = 'error: Invalid value for --loudness: unable to convert "{}" into int (see: trilitenet greet --help)\n'
@@ -155,7 +184,14 @@ def test_every_command_is_documented(command: cli.Command) -> None:
 @pytest.mark.parametrize("command", cli.COMMANDS, ids=lambda command: command.words)
 def test_every_command_has_help(command: cli.Command, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([*command.words.split(), "--help"]) == 0
-    assert f"trilitenet {command.words}" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert f"trilitenet {command.words}" in told
+    assert "--empty-" not in told
+
+
+def test_a_group_has_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["weights", "--help"]) == 0
+    assert cli.GROUPS["weights"] in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("words", [["--help"], ["--version"], ["weights", "--help"], ["wieghts"]])
@@ -299,6 +335,7 @@ def test_a_reader_that_has_gone_does_not_change_the_exit_code(tmp_path: Path) ->
         ("data check .", ">/dev/full", 1, "error: standard output: cannot be written (No space left on device)\n"),
         ("--help", ">/dev/full", 1, "error: standard output: cannot be written (No space left on device)\n"),
         ("predict -", "<&-", 1, "error: stdin: is closed\n"),
+        ("nonsense", "2>&-", 2, ""),
     ],
 )
 def test_standard_streams_that_are_closed_or_full_are_no_tracebacks(

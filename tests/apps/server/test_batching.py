@@ -120,7 +120,9 @@ def test_a_delay_waits_for_company(network: Network) -> None:
     batcher = Batcher(network, max_batch=2, delay=5.0, observe=sizes.append)
     network.gate.set()
     batcher.start()
-    futures = [batcher.submit(canvas(i), LATER) for i in range(2)]
+    futures = [batcher.submit(canvas(0), LATER)]
+    time.sleep(0.1)
+    futures.append(batcher.submit(canvas(1), LATER))
     for future in futures:
         future.result(2)
     batcher.close(10)
@@ -138,10 +140,27 @@ class Clock:
         return self.now
 
 
+def test_the_time_in_the_queue_and_that_in_the_network_are_told() -> None:
+    clock = Clock()
+
+    def run(batch: NDArray[np.uint8]) -> RawOutputs:
+        clock.now += 3
+        return RawOutputs(None, batch[..., 0].copy(), None)
+
+    batcher = Batcher(run, max_batch=1, clock=clock)
+    future = batcher.submit(canvas(0), LATER)
+    clock.now += 2
+    batcher.start()
+    assert future.result(5)[1:] == (2.0, 3.0)
+    batcher.close(10)
+
+
 def test_admission_counts_and_tells_how_long_to_wait() -> None:
     clock = Clock()
     admission = Admission(4, clock=clock)
+    clock.now += 500
     admission.observe(1)  # the first run, before any request, teaches nothing
+    assert admission.seconds_each == 0.1
     clock.now += 500
     admission.enter(3)
     with pytest.raises(BusyError):
@@ -188,6 +207,17 @@ def test_a_slow_machine_gives_fewer_places_away() -> None:
         clock.now += 0.01
         admission.observe(1)
     admission.enter(62)
+
+
+def test_one_that_enters_later_does_not_shorten_what_the_first_took() -> None:
+    clock = Clock()
+    admission = Admission(4, clock=clock)
+    admission.enter()
+    clock.now += 5.0
+    admission.enter()
+    clock.now += 5.0
+    admission.observe(1)
+    assert admission.seconds_each == pytest.approx(0.1 + 0.1 * (10.0 - 0.1))
 
 
 @pytest.mark.parametrize("missing", ["detection", "drivable", "lane"])

@@ -102,6 +102,46 @@ def test_settings_must_fit_each_other() -> None:
         Settings(queue=4, max_images=5)
     with pytest.raises(ConfigError, match="memory"):
         Settings(max_pixels=200_000_000)
+    least = 2 * 1000 + 10 * 500  # the body twice, as it is and in parts, and the picture
+    assert Settings(max_body=1000, max_pixels=500, memory=least).memory == least
+    with pytest.raises(ConfigError, match=f"memory .* must be at least {least}"):
+        Settings(max_body=1000, max_pixels=500, memory=least - 1)
+
+
+def test_a_token_is_long_enough_and_one_word() -> None:
+    assert Settings(token="a" * 16).token == "a" * 16
+    with pytest.raises(ConfigError, match="at least 16"):
+        Settings(token="a" * 15)
+    with pytest.raises(ConfigError, match="without spaces"):
+        Settings(token="two words of a token")
+
+
+@pytest.mark.parametrize(("cores", "threads"), [(1, 1), (6, 6), (64, 8)])
+def test_threads_follow_the_cores_up_to_eight(monkeypatch: pytest.MonkeyPatch, cores: int, threads: int) -> None:
+    monkeypatch.setattr("trilitenet.apps.server.settings.usable_cores", lambda: cores)
+    assert Settings().thread_count == threads
+    assert Settings(threads=3).thread_count == 3
+
+
+def test_batches_are_as_large_as_there_are_streams(started: list[Any], backend: FakeBackend) -> None:
+    command.serve(port=0)
+    backend.streams = 3  # type: ignore[attr-defined]
+    command.serve(port=0)
+    command.serve(port=0, max_batch=5)
+    assert [_settings(server).max_batch for server in started] == [8, 3, 5]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere these options mean other things")
+def test_a_port_can_be_taken_again_at_once_and_v6_leaves_v4_alone() -> None:
+    with command._listen("127.0.0.1", 0) as listener:
+        assert listener.getsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR) == 1
+    if socket.has_ipv6:
+        try:
+            listener = command._listen("::1", 0)
+        except ConfigError:
+            return  # compiled in, but switched off
+        with listener:
+            assert listener.getsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY) == 1
 
 
 @pytest.mark.parametrize("name", ["deadline", "drain", "batch_delay", "upload_timeout"])

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import io
 import json
 import threading
 import time
@@ -10,13 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from starlette.testclient import TestClient
 
 from tests.apps.server.conftest import MakeApp, Running, encode, picture
 from trilitenet.apps.server.application import Application
-from trilitenet.apps.server.inference_protocol import _parse
+from trilitenet.apps.server.inference_protocol import _boxes, _parse
 from trilitenet.apps.server.problems import ProblemError
 from trilitenet.apps.server.settings import Settings
+from trilitenet.structures import Boxes, Perception
 
 
 def test_tritons_client_gets_right_answers(app: Application, run_app: Callable[[Application], Running]) -> None:
@@ -276,3 +279,76 @@ def test_several_images_take_as_many_places(make_app: MakeApp) -> None:
         with app.service.admit(1):
             assert client.post("/v2/models/tiny/infer", json=request).status_code == 503
     assert app.service.admission.taken == 0
+
+
+def _binary(shape: list[int], data: bytes, datatype: str = "UINT8", **more: Any) -> dict[str, Any]:
+    """What `TestClient.post` takes for a request whose tensor comes behind the JSON."""
+    tensor = {"name": "image", "datatype": datatype, "shape": shape, "parameters": {"binary_data_size": len(data)}}
+    head = json.dumps({"inputs": [tensor], **more}).encode()
+    return {"content": head + data, "headers": {"inference-header-content-length": str(len(head))}}
+
+
+def test_the_images_of_a_request_are_paid_for(make_app: MakeApp) -> None:
+    with TestClient(make_app(memory=220_000, max_body=100_000, max_pixels=2000)) as client:
+        for count, status in ((4, 200), (16, 413)):  # 10 bytes a pixel: 80 kB, and 320 kB, beside the body
+            request = _binary([count, 40, 50, 3], bytes(count * 6000))
+            answer = client.post("/v2/models/tiny/infer", **request)
+            assert answer.status_code == status
+    assert "memory" in answer.json()["error"]
+
+
+def test_as_many_images_as_are_taken_at_once(client: TestClient) -> None:
+    for count, status in ((16, 200), (17, 413)):
+        request = _binary([count, 2, 2, 3], bytes(count * 12))
+        assert client.post("/v2/models/tiny/infer", **request).status_code == status
+
+
+def test_what_may_be_left_out_or_said_twice(client: TestClient) -> None:
+    body = json.dumps({**_tensor(), "outputs": []}).encode()
+    whole = client.post(
+        "/v2/models/tiny/infer", content=body, headers={"inference-header-content-length": str(len(body))}
+    )
+    assert [output["name"] for output in whole.json()["outputs"]] == ["boxes", "drivable", "lane"]
+    asked = {**_tensor(), "parameters": {"binary_data_output": True}, "outputs": [{"name": "lane"}]}
+    lane = client.post("/v2/models/tiny/infer", json=asked)
+    assert lane.headers["content-type"] == "application/octet-stream"
+    assert lane.content[int(lane.headers["inference-header-content-length"]) :] == bytes(4)
+    column = {**_file(32, 32)}
+    column["inputs"][0]["shape"] = [1, 1]
+    assert client.post("/v2/models/tiny/infer", json=column).status_code == 200
+
+
+@pytest.mark.parametrize(("turned", "message"), [(False, "must have one size"), (True, "after their EXIF rotation")])
+def test_images_of_two_sizes_do_not_go_together(client: TestClient, turned: bool, message: str) -> None:
+    size = (40, 30) if turned else (30, 40)
+    image = Image.fromarray(np.zeros((*size, 3), np.uint8))
+    exif = image.getexif()
+    exif[0x0112] = 6
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", **({"exif": exif} if turned else {}))
+    files = [encode(np.zeros((40, 30, 3), np.uint8)), buffer.getvalue()]
+    texts = [base64.b64encode(file).decode() for file in files]
+    answer = client.post("/v2/models/tiny/infer", json=_tensor(datatype="BYTES", shape=[2], data=texts))
+    assert answer.status_code == 400
+    assert message in answer.json()["error"]
+
+
+def test_fewer_boxes_are_filled_up() -> None:
+    box = Boxes(np.array([[1, 2, 3, 4]], np.float32), np.array([0.5], np.float32), np.array([0]))
+    rows = _boxes([Perception((9, 9), boxes=box), Perception((9, 9), boxes=Boxes.empty())])
+    assert rows.tolist() == [[[1, 2, 3, 4, 0.5, 0]], [[-1] * 6]]
+
+
+def test_extensions_that_are_not_there_are_refused(client: TestClient) -> None:
+    asked = {**_tensor(), "outputs": [{"name": "boxes", "parameters": {"classification": 3}}]}
+    answer = client.post("/v2/models/tiny/infer", json=asked)
+    assert answer.status_code == 400
+    assert "classification extension" in answer.json()["error"]
+
+
+def test_the_protocols_probes_follow_the_life_of_the_service(app: Application) -> None:
+    client = TestClient(app)
+    assert (client.get("/v2/health/live").status_code, client.get("/v2/health/ready").status_code) == (200, 503)
+    with client:
+        assert client.get("/v2/health/ready").json() == {"ready": True}
+    assert (client.get("/v2/health/live").status_code, client.get("/v2/health/ready").status_code) == (503, 503)

@@ -165,3 +165,15 @@ def test_endless_segments_are_refused() -> None:
         with pytest.raises(ProblemError, match="segments") as caught:
             read_header(data[:place] + b"\xff\xfe\x00\x02" * 1_000 + data[place:])
         assert caught.value.status == 413
+
+
+def test_flags_beside_the_sizes_of_webp_are_no_part_of_them() -> None:
+    lossy = bytearray(encode(picture(61, 47), "WEBP", lossless=False))
+    start = lossy.index(b"\x9d\x01\x2a") + 3
+    lossy[start + 1] |= 0xC0  # how to scale the picture when it is shown
+    lossy[start + 3] |= 0x40
+    assert read_header(bytes(lossy)) == Header("WEBP", 61, 47, 1)
+    clear = np.concatenate([picture(61, 47), np.full((47, 61, 1), 9, np.uint8)], axis=2)
+    lossless = encode(clear, "WEBP", lossless=True)  # with a flag for its alpha
+    assert lossless[12:16] == b"VP8L"
+    assert read_header(lossless) == Header("WEBP", 61, 47, 1)

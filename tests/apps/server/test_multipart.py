@@ -38,6 +38,8 @@ def test_preamble_and_quoted_boundary() -> None:
         (_part("image", b"1") + b"--xyz--", "multipart/form-data; boundary="),
         (_part("image", b"1") + b"--xyz--", "multipart/form-data; boundary*" + "1" * 5000 + "=xyz"),
         (_part("image", b"1") + b"--xyz--", "multipart/form-data; boundary=" + "x" * 300),
+        (b"--" + b"x" * 201 + b"\r\n\r\n\r\n--" + b"x" * 201 + b"--", "multipart/form-data; boundary=" + "x" * 201),
+        (b"--xyz\r\nno headers end\r\n" + _part("image", b"1") + b"--xyz--", TYPE),
     ],
 )
 def test_broken_forms_are_refused(body: bytes, content_type: str) -> None:

@@ -18,6 +18,7 @@ from trilitenet.apps.server.intake import Header, read_header
 from trilitenet.apps.server.openapi import BatchPrediction, Prediction, ProtocolErrorAnswer
 from trilitenet.config import ArtefactInfo
 from trilitenet.inference.predictor import Predictor
+from trilitenet.processing.drawing import DRIVABLE_COLOUR, LANE_COLOUR
 from trilitenet.structures import Perception
 
 
@@ -116,6 +117,7 @@ def test_masks_are_one_palette_picture(client: TestClient, app: Application) -> 
     np.testing.assert_array_equal(values & 1 > 0, seen.drivable)
     np.testing.assert_array_equal(values & 2 > 0, seen.lane)
     assert set(np.unique(values)) == {0, 1, 2, 3}
+    assert (image.getpalette() or [])[:9] == [0, 0, 0, *DRIVABLE_COLOUR, *LANE_COLOUR]
 
 
 def test_a_batch_gives_each_image_its_own_status(client: TestClient, jpeg: bytes, backend: FakeBackend) -> None:
@@ -241,6 +243,7 @@ def test_probes_follow_the_life_of_the_service(app: Application) -> None:
         answer = client.get("/readyz")
         assert answer.status_code == 503
         assert answer.headers["connection"] == "close"
+        assert client.get("/v1/models").json()["models"][0]["ready"] is False
     assert client.get("/healthz").status_code == 503
 
 
@@ -304,6 +307,28 @@ def test_a_batch_beyond_all_memory_refuses_what_does_not_fit(make_app: MakeApp) 
         assert 'trilitenet_rejects_total{reason="too_much_memory"} 1.0' in client.get("/metrics").text
 
 
+def test_a_batch_that_would_fit_later_is_refused_as_a_whole(make_app: MakeApp) -> None:
+    app = make_app(memory=3_000_000, max_body=100_000, max_pixels=200_000)
+    app.service.memory.take(1_000_000)  # by others: the first picture still fits, the second does not
+    with TestClient(app) as client:
+        file = encode(picture(400, 300), "PNG")
+        answer = client.post("/v1/predict/batch", files=[("images", ("a", file))] * 2)
+    assert answer.status_code == 503
+    assert answer.json()["error"]["code"] == "memory"
+    assert answer.headers["retry-after"] == "1"
+
+
+def test_the_parts_of_a_form_are_paid_for_beside_it(make_app: MakeApp) -> None:
+    small = encode(picture(20, 20), "PNG")
+    large = small + bytes(90_000)
+    with TestClient(make_app(memory=210_000, max_body=100_000, max_pixels=1000)) as client:
+        files = [("images", ("a", large)), *[("images", ("b", small))] * 7]
+        answer = client.post("/v1/predict/batch", files=files)
+    # Twice 90 kB and a little, and 4 kB a picture: the last one is too much.
+    assert [result["status"] for result in answer.json()["results"]][:4] == [200] * 4
+    assert answer.json()["results"][-1]["error"]["code"] == "too_much_memory"
+
+
 def test_a_batch_for_which_there_was_no_time_is_refused_as_a_whole(
     make_app: MakeApp, backend: FakeBackend, jpeg: bytes
 ) -> None:
@@ -316,6 +341,7 @@ def test_a_batch_for_which_there_was_no_time_is_refused_as_a_whole(
         text = client.get("/metrics").text
     assert late.status_code == 503
     assert late.json()["error"]["code"] == "deadline"
+    assert late.json()["error"]["message"] == "the image waited too long; try again soon"
     assert int(late.headers["retry-after"]) >= 1
     assert [result["status"] for result in mixed.json()["results"]] == [503, 415]
     assert 'trilitenet_rejects_total{reason="deadline"} 2.0' in text
@@ -335,6 +361,17 @@ def test_a_refused_image_is_not_charged_to_the_next(
 
 def test_a_slash_too_many_leads_nowhere(client: TestClient) -> None:
     assert client.get("/v1/models/", follow_redirects=False).status_code == 404
+
+
+def test_a_wrong_method_is_told_the_right_one(client: TestClient) -> None:
+    answer = client.get("/v1/predict")
+    assert (answer.status_code, answer.headers["allow"]) == (405, "POST")
+    assert answer.json()["error"]["code"] == "method_not_allowed"
+
+
+@pytest.mark.parametrize("path", ["/docs", "/redoc"])
+def test_no_page_loads_scripts_from_elsewhere(client: TestClient, path: str) -> None:
+    assert client.get(path).status_code == 404
 
 
 def _documented(schema: dict[str, Any], path: str, method: str) -> set[str]:
@@ -380,3 +417,25 @@ def test_the_schema_says_where_the_token_is_asked_for(make_app: MakeApp, token: 
         for method, operation in operations.items():
             assert ("401" in _documented(schema, path, method)) == (path not in PUBLIC_PATHS)
             assert operation.get("security") == (None if path in PUBLIC_PATHS else expected)
+
+
+def test_a_place_that_was_waited_for_in_vain_tells_how_slow_the_machine_is(
+    make_app: MakeApp, backend: FakeBackend, monkeypatch: pytest.MonkeyPatch, jpeg: bytes
+) -> None:
+    app = make_app(deadline=0.2)
+    skipped: list[int] = []
+    monkeypatch.setattr(app.service.admission, "skip", lambda: skipped.append(1))
+    assert app.service.admission.patience == pytest.approx(0.12)
+    with TestClient(app) as client:
+        backend.gate.clear()
+        assert client.post("/v1/predict", content=jpeg).status_code == 503
+        backend.gate.set()
+    assert skipped == []
+
+
+def test_milliseconds_are_milliseconds(client: TestClient, app: Application, backend: FakeBackend, jpeg: bytes) -> None:
+    backend.seconds = 0.05
+    assert app.service.admission.seconds_each == 0.1
+    answer = client.post("/v1/predict", content=jpeg).json()
+    assert 50 <= answer["milliseconds"]["network"] < 50_000
+    assert app.service.admission.seconds_each != 0.1  # learned from it
