@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from trilitenet.errors import ShapeError
-from trilitenet.structures import Boxes, Perception
+from trilitenet.structures import Boxes, Perception, RawOutputs
 
 
 def boxes(*class_id: int) -> Boxes:
@@ -26,3 +26,24 @@ def test_selected_boxes_keep_all_that_is_known_of_them() -> None:
 def test_a_class_without_a_name_is_refused(class_id: int) -> None:
     with pytest.raises(ShapeError, match=f"class id {class_id} has no name"):
         Perception((10, 10), ("car", "bus"), boxes(0, class_id, 1))
+
+
+def test_a_number_is_no_list_of_boxes() -> None:
+    with pytest.raises(ShapeError, match=r"xyxy must be \(N, 4\), got \(\)"):
+        Boxes(np.float32(1), np.zeros(0, np.float32), np.zeros(0, np.int64))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("detection", np.zeros((1, 2, 5), np.float32)),  # no class
+        ("detection", np.zeros((2, 6), np.float32)),
+        ("drivable", np.zeros((1, 4, 4), np.float32)),
+        ("lane", np.zeros((4, 4), np.uint8)),
+    ],
+)
+def test_outputs_of_another_form_are_refused(field: str, value: np.ndarray) -> None:
+    outputs = {"detection": None, "drivable": None, "lane": None, field: value}
+    with pytest.raises(ShapeError, match=f"{field} must be"):
+        RawOutputs(**outputs)
+    RawOutputs(np.zeros((1, 0, 6), np.float32), None, None)
