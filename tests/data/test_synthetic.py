@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +14,12 @@ from PIL import Image
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.sample import Sample
 from trilitenet.data.synthetic import Scene, SyntheticScenes
+from trilitenet.data.synthetic_chance import random_layout
 from trilitenet.data.synthetic_drive import SyntheticDrive
 from trilitenet.data.synthetic_files import annotation, write_dataset
 from trilitenet.data.synthetic_render import FIRST_VEHICLE, render
+from trilitenet.data.synthetic_vehicles import VehiclePose
+from trilitenet.data.synthetic_world import Course, Vehicle
 from trilitenet.errors import ConfigError, OutputError
 
 SIZE = (192, 320)
@@ -34,7 +39,8 @@ def test_a_scene_depends_on_seed_and_index_alone() -> None:
     np.testing.assert_array_equal(sample.boxes, other.boxes)
     np.testing.assert_array_equal(sample.lane, other.lane)
     assert not np.array_equal(first[3].image, first[4].image)
-    assert not np.array_equal(first[3].image, SyntheticScenes(8, SIZE)[3].image)
+    for index in (2, 3):
+        assert not np.array_equal(first[3].image, SyntheticScenes(8, SIZE)[index].image)
 
 
 def test_samples_are_whole_and_varied(scenes: list[Scene]) -> None:
@@ -125,6 +131,8 @@ def test_labels_can_be_the_paint() -> None:
 def test_refuses_nonsense() -> None:
     with pytest.raises(IndexError):
         SyntheticScenes(0, SIZE, 3)[3]
+    with pytest.raises(IndexError):
+        SyntheticScenes(0, SIZE, 3)[-1]
     with pytest.raises(ConfigError, match="labels"):
         SyntheticScenes(labels="dots")  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="size"):
@@ -233,3 +241,73 @@ def test_a_drive_changes_lanes_and_has_a_lead() -> None:
     assert abs(offsets[-1]) < 0.3
     assert drive[0].truth.lead is not None
     assert drive[0].truth.camera == drive[240].truth.camera
+
+
+def test_the_truth_is_told_from_the_own_lane(scenes: list[Scene]) -> None:
+    bends = 0
+    for truth in (scene.truth for scene in scenes):
+        assert abs(truth.offset) <= truth.lane_width / 2 + 1e-6
+        places = [line.d for line in truth.lines]
+        assert places == sorted(places, reverse=True)  # from the left to the right
+        for line in truth.lines:
+            assert line.polynomial[0] == pytest.approx(line.d - truth.offset, abs=0.2)
+            assert line.polynomial[1] == pytest.approx(-truth.heading, abs=0.03)
+            if abs(truth.curvature) > 0.002:
+                bends += 1
+                assert 2 * line.polynomial[2] == pytest.approx(truth.curvature, rel=0.4)
+        for thing in truth.objects:
+            if thing.distance < 12:
+                assert thing.lateral == pytest.approx(thing.d - truth.offset, abs=1.0)
+    assert bends > 10
+
+
+def test_the_lead_is_the_nearest_in_the_own_lane_that_is_seen(scenes: list[Scene]) -> None:
+    truth = next(scene.truth for scene in scenes if scene.truth.objects)
+    thing = truth.objects[0]
+
+    def lead(*places: tuple[float, float, bool]) -> float | None:
+        objects = [dataclasses.replace(thing, distance=x, d=d, ignored=hidden) for x, d, hidden in places]
+        found = dataclasses.replace(truth, objects=tuple(objects)).lead
+        return None if found is None else found.distance
+
+    side = truth.lane_width / 2 + 0.1
+    assert lead((40, 0.3, False), (10, 0, True), (15, side, False), (30, -0.3, False)) == 30
+    assert lead((15, side, False), (10, 0, True)) is None
+
+
+def test_a_layout_in_the_mirror() -> None:
+    for kind in ("motorway", "country", "city"):
+        layout = random_layout(np.random.default_rng(3), kind)  # type: ignore[arg-type]
+        other = layout.mirrored()
+        assert other.drivable == (-layout.drivable[1], -layout.drivable[0])
+        assert [mark.d for mark in other.markings] == [-mark.d for mark in layout.markings]
+        assert other.oncoming == tuple(-d for d in layout.oncoming) != ()
+        assert other.mirrored() == layout
+
+
+def test_lines_of_a_course_are_parallel() -> None:
+    course = Course(np.zeros_like, offset=0.5, heading=0.1)
+    middle, left = course.line(0.0), course.line(2.0)
+    slope = np.diff(middle[:, 1]) / np.diff(middle[:, 0])
+    np.testing.assert_allclose(slope, -math.tan(0.1), rtol=1e-6)
+    np.testing.assert_allclose((left[:, 1] - middle[:, 1]) * math.cos(0.1), 2.0, rtol=1e-6)
+    assert middle[0, 1] == pytest.approx(-0.5 / math.cos(0.1))
+
+
+@pytest.mark.parametrize("yaw", [0.0, math.pi])
+def test_a_vehicle_is_placed_by_the_end_that_is_nearest(yaw: float) -> None:
+    pose = VehiclePose(Vehicle("sedan", 20.0, 1.0, yaw, (9.0, 9.0, 9.0), 1.05), 20.0, 1.0, yaw)
+    box = pose.ground_box
+    length, width = pose.shape.length * 1.05, pose.shape.width * 1.05
+    np.testing.assert_allclose([box[:, 0].min(), box[:, 0].max()], [20, 20 + length])
+    np.testing.assert_allclose([box[:, 1].min(), box[:, 1].max()], [1 - width / 2, 1 + width / 2])
+
+
+def test_the_way_aside_and_its_rate_agree() -> None:
+    drive = SyntheticDrive(1, frames=250, fps=25, size=(96, 160))
+    before, change = drive._aside(0.0), 0.45 * drive.duration
+    for time in (1.0, change + 1.0, change + 2.25, change + 4.0):
+        (after, _), (earlier, _) = drive._aside(time + 1e-4), drive._aside(time - 1e-4)
+        assert drive._aside(time)[1] == pytest.approx((after - earlier) / 2e-4, abs=1e-4)
+    weave = drive._aside(7 * 3)[0] - before[0]  # three whole periods of it later
+    assert weave == pytest.approx(drive._layout.lane_width)

@@ -26,6 +26,25 @@ def test_every_answer_has_the_security_headers(client: TestClient, path: str) ->
     assert "server" not in headers
 
 
+def test_the_page_may_load_its_own_files(client: TestClient) -> None:
+    headers = client.get("/").headers
+    assert "script-src 'self'" in headers["content-security-policy"]
+    assert headers["cache-control"] == "no-cache"
+    assert client.get("/v1/models").headers["cache-control"] == "no-store"
+
+
+def test_links_from_elsewhere_lead_to_the_page(client: TestClient) -> None:
+    assert client.get("/", headers={"sec-fetch-site": "cross-site"}).status_code == 200
+
+
+def test_the_largest_body_is_taken(make_app: MakeApp, jpeg: bytes) -> None:
+    with TestClient(make_app(max_body=len(jpeg))) as client:
+        for body, status in ((jpeg, 200), (jpeg + b"x", 413)):
+            assert client.post("/v1/predict", content=body).status_code == status
+        given = {"content-encoding": "Identity"}
+        assert client.post("/v1/predict", content=jpeg, headers=given).status_code == 200
+
+
 @pytest.mark.parametrize("path", ["/", "/healthz", "/metrics", "/v1/models", "/v2", "/openapi.json", "/nowhere"])
 def test_head_is_answered_as_get_without_the_body(
     app: Application, run_app: Callable[[Application], Running], path: str
@@ -90,7 +109,9 @@ class TestToken:
 
     @pytest.mark.parametrize("scheme", ["Bearer", "bearer"])
     def test_with_it_there_is_everything(self, client: TestClient, scheme: str) -> None:
-        assert client.get("/v1/models", headers={"authorization": f"{scheme} {TOKEN}"}).status_code == 200
+        for space in (" ", "  "):
+            answer = client.get("/v1/models", headers={"authorization": f"{scheme}{space}{TOKEN}"})
+            assert answer.status_code == 200
 
     @pytest.mark.parametrize("path", ["/", "/app.js", "/app.css", "/icon.svg", "/healthz", "/readyz"])
     def test_page_and_probes_need_none(self, client: TestClient, path: str) -> None:

@@ -282,6 +282,7 @@ def test_metrics_count_what_happened(client: TestClient, jpeg: bytes) -> None:
     assert 'trilitenet_rejects_total{reason="unsupported_type"} 1.0' in text
     for stage in ("upload", "decode", "preprocess", "queue", "network", "postprocess", "encode"):
         assert f'trilitenet_stage_seconds_count{{stage="{stage}"}}' in text
+    assert 'trilitenet_stage_seconds_count{stage="upload"} 2.0' in text
     assert "trilitenet_accepted 0.0" in text
     assert "trilitenet_memory_bytes 0.0" in text
 

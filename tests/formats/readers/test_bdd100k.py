@@ -289,7 +289,7 @@ def test_curves_are_curves_in_both_forms() -> None:
     points = [[0.0, 0.0], [0.0, 40.0], [40.0, 40.0], [40.0, 0.0]]
     forms = [raw_bdd.old_poly(points, "LCCC"), raw_bdd.new_poly(points, "LCCC", closed=False)]
     lanes = [parse_labels({"labels": [{**LANE, "poly2d": form}]}, Path("x.jpg"), "x.json").lane for form in forms]
-    old, new = (np.asarray(lane[0].points) for lane in lanes if isinstance(lane, tuple))
+    old, new = (np.asarray(lane[0].points) for lane in lanes if isinstance(lane, tuple))  # type: ignore[union-attr]
     np.testing.assert_array_equal(old, new)
     assert np.abs(old - (20, 30)).sum(axis=1).min() < 1  # a cubic is there half-way: (0 + 3 x 40 + 3 x 40 + 0) / 8
     assert old[:, 1].max() < 31
