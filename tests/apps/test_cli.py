@@ -37,6 +37,8 @@ def greet(monkeypatch: pytest.MonkeyPatch) -> list[object]:
         calls.append((name, loudness))
         if name == "nobody":
             raise OutputError("nobody: cannot be greeted")
+        if name == "somebody":
+            raise OSError("as nobody foresaw")
         if name in {"ctrl-c", "sigterm"}:
             signal.raise_signal(signal.SIGTERM if name == "sigterm" else signal.SIGINT)
             calls.append("not reached")
@@ -69,6 +71,11 @@ def test_an_error_is_one_line(greet: list[object], capsys: pytest.CaptureFixture
     captured = capsys.readouterr()
     assert captured.err == "error: nobody: cannot be greeted\n"
     assert captured.out == ""
+
+
+def test_what_nobody_foresaw_is_not_taken_for_a_full_output(greet: list[object]) -> None:
+    with pytest.raises(OSError, match="as nobody foresaw"):
+        cli.main(["greet", "somebody"])
 
 
 @pytest.fixture

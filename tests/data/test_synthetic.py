@@ -277,7 +277,7 @@ def test_the_lead_is_the_nearest_in_the_own_lane_that_is_seen(scenes: list[Scene
 
 def test_a_layout_in_the_mirror() -> None:
     for kind in ("motorway", "country", "city"):
-        layout = random_layout(np.random.default_rng(3), kind)  # type: ignore[arg-type]
+        layout = random_layout(np.random.default_rng(3), kind)
         other = layout.mirrored()
         assert other.drivable == (-layout.drivable[1], -layout.drivable[0])
         assert [mark.d for mark in other.markings] == [-mark.d for mark in layout.markings]

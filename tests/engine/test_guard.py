@@ -47,6 +47,10 @@ def test_puts_back_the_statistics_that_a_bad_step_spoiled() -> None:
     network(torch.full((4, 2), float("nan")))
     guard.good(1, (), BAD, BAD)
     torch.testing.assert_close(dict(network.named_buffers()), kept)
+    network(torch.randn(4, 2))
+    learned = {name: buffer.clone() for name, buffer in network.named_buffers()}
+    assert guard.good(2, (), GOOD, GOOD)  # the bad step is done with
+    torch.testing.assert_close(dict(network.named_buffers()), learned)
 
 
 def test_without_waiting_the_optimiser_skips_by_itself() -> None:
