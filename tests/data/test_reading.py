@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from pathlib import Path
@@ -205,12 +206,16 @@ def test_mixed_data_sets(root: Path, tmp_path: Path) -> None:
         mixed[11]
     with pytest.raises(DataError, match="above 0"):
         MixedDataset([(one, 0.0)])
+    with pytest.raises(DataError, match="above 0 and finite, got inf"):
+        MixedDataset([(one, 1.0), (two, math.inf)])
     with pytest.raises(DataError, match="at least one"):
         MixedDataset([])
     with pytest.raises(DataError, match="different classes"):
         MixedDataset([(one, 1.0), (DrivingDataset(root, "train", class_names=["car"]), 1.0)])
     with pytest.raises(DataError, match="negative"):
         sampling_weights(one, {"timeofday": {"night": -1.0}})
+    with pytest.raises(DataError, match="night must be finite"):
+        sampling_weights(one, {"timeofday": {"night": math.inf}})
     with pytest.raises(DataError, match="every sampling weight is 0"):
         sampling_weights(one, {"timeofday": {"night": 0.0, "day": 0.0, "": 0.0}})
 

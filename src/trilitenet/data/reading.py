@@ -18,6 +18,7 @@ import functools
 import hashlib
 import json
 import logging
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -376,7 +377,7 @@ class MixedDataset:
             equal = every sample once an epoch.
 
     Raises:
-        DataError: If there is none, a weight is not positive, or the class names differ.
+        DataError: If there is none, a weight is not positive and finite, or the class names differ.
     """
 
     def __init__(self, parts: Sequence[tuple[SampleSource, float]]) -> None:
@@ -384,8 +385,8 @@ class MixedDataset:
             raise DataError("at least one data set is needed")
         names = parts[0][0].class_names
         for dataset, weight in parts:
-            if not weight > 0:
-                raise DataError(f"a data set's weight must be above 0, got {weight}")
+            if not 0 < weight < math.inf:
+                raise DataError(f"a data set's weight must be above 0 and finite, got {weight}")
             if dataset.class_names != names:
                 raise DataError(
                     f"data sets with different classes, {names} and {dataset.class_names}; give both the same `classes`"
@@ -434,13 +435,13 @@ def sampling_weights(dataset: SampleSource, table: Mapping[str, Mapping[str, flo
         (N,) float64, relative weights.
 
     Raises:
-        DataError: If a factor is negative, or all weights are 0.
+        DataError: If a factor is negative or infinite, or all weights are 0.
     """
     weights = dataset.weights if isinstance(dataset, MixedDataset) else np.ones(len(dataset), np.float64)
     for attribute, factors in table.items():
         for value, factor in factors.items():
-            if not factor >= 0:
-                raise DataError(f"sampling weight of {attribute}={value} must not be negative, got {factor}")
+            if not 0 <= factor < math.inf:
+                raise DataError(f"sampling weight of {attribute}={value} must be finite and not negative, got {factor}")
     if table:
         known: dict[str, set[str]] = {}
         for index in range(len(dataset)):
