@@ -534,6 +534,25 @@ def test_not_finite_steps_are_left_out_and_end_the_run(
         train(**logged(scenes, tmp_path / "all"))
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:127] err == 0. DefaultCPUAllocator: can't allocate memory: ..."),
+    ],
+)
+def test_a_step_without_memory_is_told_in_one_line(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: RuntimeError
+) -> None:
+    def forward(self: TriLiteNet, image: torch.Tensor) -> Any:
+        raise error
+
+    monkeypatch.setattr(TriLiteNet, "forward", forward)
+    told = r"cpu is out of memory in step 0 \(a batch of 4 images of 128x64, --accumulate 1\); raise --accumulate"
+    with pytest.raises(TrainingError, match=told):
+        train(**settings(scenes, tmp_path, max_steps=1))
+
+
 def test_refusals(scenes: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no data"):
         train()

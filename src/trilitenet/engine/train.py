@@ -42,6 +42,9 @@ log = logging.getLogger(__name__)
 CHECKPOINT_NAME: Final = "last.ckpt"
 """The checkpoint in the run's folder that `--resume` continues from."""
 
+_NO_MEMORY: Final = "DefaultCPUAllocator"
+"""What PyTorch's RuntimeError names where a CPU has no memory left; of other devices there is a class of errors."""
+
 _RESULTS: Final = (CHECKPOINT_NAME, "final.safetensors", "best-*.safetensors")
 _TRACES: Final = ("config.yaml", "metrics.csv", "results", "tensorboard")
 
@@ -241,8 +244,8 @@ class Trainer:
 
         Raises:
             DataError: If an image or label cannot be read.
-            TrainingError: If the loss or gradient is not finite ten steps in a row, or a process that reads images was
-                killed.
+            TrainingError: If the loss or gradient is not finite ten steps in a row, the device is out of memory, or a
+                process that reads images was killed.
             WeightsError: If the checkpoint is damaged or of another run.
         """
         if resume is not None:
@@ -262,6 +265,13 @@ class Trainer:
             self.save()  # it came between two steps
             raise DataError(f"{error}; once that is mended, {RESUME}") from error
         except RuntimeError as error:
+            if isinstance(error, torch.OutOfMemoryError) or _NO_MEMORY in str(error):
+                height, width = self.config.input_size
+                raise TrainingError(
+                    f"{self.fabric.device} is out of memory in step {self.step} (a batch of {self.config.batch_size} "
+                    f"images of {width}x{height}, --accumulate {self.config.accumulate}); raise --accumulate, or lower "
+                    "--batch-size, --input-size or --multi-scale"
+                ) from error
             if not str(error).startswith(WORKER_LOST):
                 raise
             raise TrainingError(
