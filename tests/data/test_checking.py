@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.data.published import write_annotation, write_published
+from trilitenet.data import checking
 from trilitenet.data.checking import KINDS, CheckReport, check_dataset, detect_layout
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.errors import DataError
@@ -269,3 +272,22 @@ def test_described_values_are_expected(root: Path) -> None:
     draw_mask(root, np.full((72, 128), 77, np.uint8))
     annotate(root, box(10, 10, 40, 30, "cra"))
     assert check_dataset(root).ok
+
+
+def test_many_pictures_of_one_hash_are_compared_at_once() -> None:
+    rng = np.random.default_rng(0)
+
+    def fact(number: int) -> checking._Facts:
+        thumb = rng.integers(0, 256, 256, dtype=np.uint8).tobytes() if number != 1 else same
+        digest = number.to_bytes(12, "big")
+        return checking._Facts(str(number), (9, 16), digest, 5, thumb, (), {}, np.zeros((0, 2), np.float32), {}, {}, ())
+
+    same = bytes(range(256))
+    facts = {"train": [fact(number) for number in range(2000)]}
+    facts["val"] = [dataclasses.replace(facts["train"][1], digest=b"other"), *(fact(2000 + i) for i in range(300))]
+    collector = checking._Collector(5)
+    began = time.process_time()
+    checking._find_near_duplicates(facts, collector)
+    assert time.process_time() - began < 1.5  # many times as long, were each pair compared by itself
+    (finding,) = collector.findings()
+    assert (finding.count, finding.examples) == (1, ("val/1 ~ train/1",))
