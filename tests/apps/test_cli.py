@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -289,9 +290,19 @@ def test_several_values_may_follow_one_option() -> None:
         ("evaluate --by scene weather tiny", "evaluate --by scene --by weather tiny"),
         ("export --format onnx tiny", "export --format onnx tiny"),
         ("train --tasks detection lane r.yaml", "train --tasks detection --tasks lane r.yaml"),
+        ("train --freeze encoder spp.reduce r.yaml", "train --freeze encoder --freeze spp.reduce r.yaml"),
+        ("weights finish A B --card a.yaml b.yml", "weights finish A B --card a.yaml --card b.yml"),
+        ("train --classes car truck r.yaml", "train --classes car --classes truck r.yaml"),
+        ("data prepare DIR --classes car truck -h", "data prepare DIR --classes car --classes truck -h"),
+        ("score --classes car truck DIR --limit 1", "score --classes car --classes truck DIR --limit 1"),
+        ("data convert --classes FILE.yaml coco DIR OUT", "data convert --classes FILE.yaml coco DIR OUT"),
     ],
 )
-def test_no_second_value_is_taken_for_a_file(words: str, spread: str) -> None:
+def test_no_second_value_is_taken_for_a_file(
+    words: str, spread: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "DIR").mkdir()
+    monkeypatch.chdir(tmp_path)
     assert cli._repeated(words.split()) == spread.split()
 
 
@@ -300,6 +311,7 @@ def test_the_values_that_may_follow_are_those_that_there_are() -> None:
     from trilitenet.commands.load import BACKENDS
     from trilitenet.engine.scorecard import CONDITIONS
     from trilitenet.formats.writers.base import WRITERS
+    from trilitenet.models.trilitenet import build_network
     from trilitenet.processing.drawing import PARTS
     from trilitenet.road.drawing import ROAD_PARTS
 
@@ -308,6 +320,8 @@ def test_the_values_that_may_follow_are_those_that_there_are() -> None:
     assert cli._LISTS["--by"].split("|") == list(CONDITIONS)
     assert cli._LISTS["--format"].split("|") == list(WRITERS)
     assert cli._LISTS["--hide"].split("|") == [*PARTS, *ROAD_PARTS]
+    parts = [name for name, _ in build_network("tiny").named_modules() if name]
+    assert [name for name in parts if not re.fullmatch(cli._LISTS["--freeze"], name)] == []
 
 
 def test_an_unknown_level_of_the_log_is_one_line(

@@ -139,7 +139,10 @@ _LISTS: Final = {
     "--backend": "auto|torch|onnxruntime|openvino|tensorrt|ncnn",
     "--batch": r"\d+",
     "--by": "timeofday|weather|scene",
+    "--card": r".+\.ya?ml",
+    "--classes": r"[^-./\\][^./\\]*",
     "--format": "json|jsonl|scalabel|openlabel|coco|yolo|cvat|parquet|csv",
+    "--freeze": r"(encoder|spp|litepan|detection|pcaa|reduce|drivable|lane)(\.\w+)*",
     "--hide": "drivable|lane|boxes|labels|lines|distances|above|status",
     "--lane-width": r"([\w*.-]+=)?\d+(\.\d+)?",
     "--loggers": "csv|tensorboard|mlflow|wandb",
@@ -159,6 +162,8 @@ def _repeated(words: Sequence[str]) -> list[str]:
     option = ""
     for word in words:
         further = bool(option) and re.fullmatch(_LISTS[option], word) is not None
+        if option == "--classes" and os.access(word, os.F_OK):  # any word may be the name of a class
+            further = False
         if further and spread[-1] != option:
             spread.append(option)
         elif not further:
