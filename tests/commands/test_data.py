@@ -197,8 +197,10 @@ def test_show_sheets_and_pages(published: Path, tmp_path: Path) -> None:
         show(published, tmp_path / "file" / "x.jpg")
     rest = show(published, tmp_path / "rest.html", split="train", where=["timeofday=night"], start=4)
     assert rest.count == 2
-    with pytest.raises(DataError, match="no image with timeofday=noon"):
+    with pytest.raises(DataError, match="no image with timeofday=noon in any split"):
         show(published, sheet, where=["timeofday=noon"])
+    with pytest.raises(DataError, match="no image after the first 24 in val"):
+        show(published, sheet, split="val", start=24)
     with pytest.raises(ConfigError, match="ATTRIBUTE=VALUE"):
         show(published, sheet, where=["night"])
     with pytest.raises(OutputError, match="must end in"):

@@ -324,7 +324,9 @@ def show(
         if indices:
             groups[name] = (dataset, indices)
     if not groups:
-        raise DataError(f"{root}: no image with {', '.join(where) or 'anything'} in {split or 'any split'}")
+        which = f" with {', '.join(where)}" if where else ""
+        after = f" after the first {start}" if start else ""
+        raise DataError(f"{root}: no image{which}{after} in {split or 'any split'}")
     shown = sum(len(indices) for _, indices in groups.values())
     if output.suffix.lower() == ".html":
         pictures = {
