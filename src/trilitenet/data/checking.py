@@ -349,6 +349,7 @@ def _run(job: _Job, work: list[tuple[str, str]], workers: int) -> Iterator[_Fact
 def _look(job: _Job, split: str, file: str) -> _Facts:
     """Read all that belongs to one image."""
     name = Path(file).stem
+    tasks = job.description.tasks
     faults: list[tuple[str, str]] = []
     path = job.root / IMAGE_FOLDER / split / file
     size, digest, picture_hash, thumb = _look_at_image(path, f"{IMAGE_FOLDER}/{split}/{file}", faults)
@@ -361,10 +362,13 @@ def _look(job: _Job, split: str, file: str) -> _Facts:
         label = job.root / folder / split / f"{name}{ending}"
         if not label.is_file():
             continue
-        labelled.append(task)
         if task == "detection":
-            objects, box_sizes, attributes = _look_at_boxes(job, label, size, faults)
-        else:
+            found, found_sizes, attributes = _look_at_boxes(job, label, size, faults)
+            if task in tasks:
+                labelled.append(task)
+                objects, box_sizes = found, found_sizes
+        elif task in tasks:
+            labelled.append(task)
             meaning = job.description.drivable if task == "drivable" else job.description.lane
             part = _look_at_mask(label, f"{folder}/{split}/{name}{ending}", meaning, size, faults)
             if part is not None:

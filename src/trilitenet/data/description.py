@@ -57,7 +57,7 @@ class DatasetDescription:
         classes: Class name to the categories in the annotation files that belong to it, in the order of class ids.
         ignore: Categories whose boxes are neither object nor background.
         splits: The splits there are; empty = whatever folders exist.
-        tasks: Tasks that are labelled at all; the files of others are not read.
+        tasks: Tasks that are labelled at all; the labels of others are left out.
         attributes: Names of the attributes each image carries.
         drivable: What the values of the drivable masks mean.
         lane: What the values of the lane masks mean.
