@@ -64,12 +64,18 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_finished_weights_hold_thresholds_figures_and_what_people_say(scenes: Path, tmp_path: Path) -> None:
+def test_finished_weights_hold_thresholds_figures_and_what_people_say(
+    scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     first, second = tmp_path / "first.yaml", tmp_path / "second.yaml"
     first.write_text("licence: research only\nprovenance: {labels: exact}\nnotes: [far vehicles are missed]\n")
     second.write_text("provenance: {hours: '2'}\nnotes: [night is worse]\n")
     out = tmp_path / "out.safetensors"
     card = finish("tiny", out, data=scenes, card=(first, second), input_size=(192, 320), iou=0.5)
+    told = capsys.readouterr().out
+    assert told.startswith(f"model  {out} (")
+    assert f"data   {scenes} val, 3 images" in told
+    assert told.endswith(f"\nwritten to {out}\n")
     assert read_card(out) == card
     assert card.licence == "research only"
     assert {"labels": "exact", "hours": "2"}.items() <= card.provenance.items()

@@ -123,14 +123,22 @@ def finish(
             best = best_thresholds(predictor, dataset, batch_size=batch_size, progress=shown)
             predictor.thresholds = best.thresholds
             shown.name("figures")
-            report = run_evaluation(predictor, dataset, batch_size=batch_size, resamples=0, worst=0, progress=shown)
+            report = run_evaluation(
+                predictor,
+                dataset,
+                batch_size=batch_size,
+                resamples=0,
+                worst=0,
+                progress=shown,
+                about={"model": str(destination), "data": str(data), "split": split},
+            )
         figures = {f"{split} {name}": round(figure.value, 4) for name, figure in report.figures.items()}
         finished = dataclasses.replace(described, thresholds=best.thresholds, metrics=figures)
         save_network(network, destination, finished, half=not full)
     finally:
         with contextlib.suppress(OSError):  # what went wrong before is the one to tell
             draft.unlink(missing_ok=True)
-    sys.stdout.write(f"{destination}: {best.thresholds}\n{report.summary()}\n")
+    sys.stdout.write(f"{report.summary()}\nwritten to {destination}\n")
     return finished
 
 
