@@ -3,10 +3,19 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import sys
 
 import pytest
 
-from trilitenet.config import DEFAULT_ANCHORS, ArtefactInfo, ModelCard, Thresholds, parse, parse_yaml
+from trilitenet.config import (
+    DEFAULT_ANCHORS,
+    ArtefactInfo,
+    ModelCard,
+    Thresholds,
+    parse,
+    parse_json,
+    parse_yaml,
+)
 from trilitenet.errors import ConfigError, WeightsError
 
 
@@ -40,6 +49,41 @@ def test_an_unknown_key_of_a_part_is_told_with_the_nearest_of_its_own() -> None:
 def test_a_value_of_the_wrong_type_is_told_with_its_field() -> None:
     with pytest.raises(ConfigError, match=r"^here: rate: .*number.*, got 'fast'$"):
         parse(Settings, {"rate": "fast"}, "here")
+
+
+@pytest.mark.parametrize("value", ["x" * 300_000, ["x"] * 300_000, 10**5000], ids=["text", "list", "number"])
+def test_a_message_shows_the_beginning_of_a_long_value(value: object) -> None:
+    with pytest.raises(ConfigError, match=r"^here: rate: .*number.*, got ") as caught:
+        parse(Settings, {"rate": value}, "here")
+    assert len(str(caught.value)) < 400
+
+
+DEEP = sys.getrecursionlimit()
+ALIASES = "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 9))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"a0: &a0 [x]\n{ALIASES}rate: *a8\n", "its aliases stand for more than 100000 values"),
+        ("rate: &a [1, *a]\n", "an alias stands for what it is in"),
+        ("rate: !!int ''\n", "a value is not what its tag, such as !!int, says"),
+        ("rate: !!bool perhaps\n", "a value is not what its tag, such as !!int, says"),
+        ("rate: !!timestamp soon\n", "a value is not what its tag, such as !!int, says"),
+    ],
+    ids=["aliases", "itself", "int", "bool", "timestamp"],
+)
+def test_yaml_of_what_cannot_be_is_told_in_one_line(text: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_yaml(text, "here")
+    assert str(caught.value) == f"here: not YAML ({message})"
+
+
+def test_json_that_is_nested_too_deeply_is_no_json() -> None:
+    with pytest.raises(ValueError, match=r"^nested too deeply$"):
+        parse_json("[" * 20 * DEEP)
+    with pytest.raises(WeightsError, match=r"^here: its card is not JSON \(nested too deeply\)$"):
+        ModelCard.from_json("[" * 20 * DEEP, "here")
 
 
 @pytest.mark.parametrize(

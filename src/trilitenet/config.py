@@ -7,6 +7,7 @@ key is an error that names the nearest known one.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import math
 from collections.abc import Hashable, Iterable, Mapping
@@ -16,7 +17,7 @@ from typing import Any, Final, Literal, TypeVar, get_args, get_type_hints
 import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from trilitenet.errors import ConfigError, WeightsError, did_you_mean
+from trilitenet.errors import ConfigError, WeightsError, did_you_mean, shown
 
 __all__ = [
     "ARTEFACT_KEY",
@@ -43,6 +44,7 @@ __all__ = [
     "check_tasks",
     "get_variant",
     "parse",
+    "parse_json",
     "parse_yaml",
     "read_yaml",
     "shipped_weights",
@@ -304,6 +306,8 @@ class ArtefactInfo:
 
 
 _T = TypeVar("_T")
+_MOST_ALIASED: Final = 100_000
+"""Values that the aliases of a YAML text may stand for."""
 
 
 def parse(cls: type[_T], mapping: Mapping[str, Any], source: str) -> _T:
@@ -354,7 +358,7 @@ def parse_yaml(text: str, source: str) -> Any:
     """Parse YAML; ``source`` is where it came from, for messages.
 
     Raises:
-        ConfigError: If it is not YAML, or gives a key twice.
+        ConfigError: If it is not YAML, gives a key twice, or its aliases stand for far more than is written.
     """
     try:
         return yaml.load(text, _YamlLoader)  # noqa: S506 - plain values only
@@ -363,10 +367,30 @@ def parse_yaml(text: str, source: str) -> Any:
         if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
             reason = f"line {error.problem_mark.line + 1}: {error.context or ''} {error.problem}"
         raise ConfigError(f"{source}: not YAML ({' '.join(reason.split())})") from error
+    except (LookupError, AttributeError) as error:
+        raise ConfigError(f"{source}: not YAML (a value is not what its tag, such as !!int, says)") from error
 
 
 class _YamlLoader(yaml.SafeLoader):
-    """Plain values only, and no key twice: the last one would silently win."""
+    """Plain values only, no key twice (the last one would silently win), and no more by aliases than memory takes."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._sizes: dict[int, int] = {}  # of nodes that are whole: how many values each stands for
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        alias = self.check_event(yaml.AliasEvent)
+        node = super().compose_node(parent, index)
+        if alias:
+            if id(node) not in self._sizes:
+                raise ValueError("an alias stands for what it is in")
+        elif node is not None:
+            inner = node.value if isinstance(node, yaml.CollectionNode) else ()
+            parts = itertools.chain.from_iterable(inner) if isinstance(node, yaml.MappingNode) else inner
+            size = self._sizes[id(node)] = 1 + sum(self._sizes[id(part)] for part in parts)
+            if size > _MOST_ALIASED and size > len(self.buffer):
+                raise ValueError(f"its aliases stand for more than {_MOST_ALIASED} values")
+        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         keys: set[str] = set()
@@ -377,6 +401,18 @@ class _YamlLoader(yaml.SafeLoader):
                     raise yaml.constructor.ConstructorError(problem=problem, problem_mark=key.start_mark)
                 keys.add(key.value)
         return super().construct_mapping(node, deep)
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return what a JSON text says.
+
+    Raises:
+        ValueError: If it is not JSON, or is nested too deeply.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
@@ -414,7 +450,7 @@ def _read_versioned(cls: type[_T], text: str, source: str, names: tuple[str, str
     """
     what, schema_name = names
     try:
-        mapping = json.loads(text)
+        mapping = parse_json(text)
     except (TypeError, ValueError) as error:  # the former of what is no text
         raise WeightsError(f"{source}: its {what} is not JSON ({error})") from error
     if not isinstance(mapping, dict):
@@ -487,4 +523,4 @@ def _explain(cls: type[Any], error: ValidationError) -> str:
     where = f"{path}: " if path else ""
     if first["type"] == "value_error":  # raised by a dataclass itself; the input is all of its fields
         return f"{where}{first['ctx']['error']}"
-    return f"{where}{first['msg']}, got {first.get('input')!r}"
+    return f"{where}{first['msg']}, got {shown(first.get('input'))}"

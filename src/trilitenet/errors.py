@@ -47,6 +47,7 @@ __all__ = [
     "import_extra",
     "part_of",
     "replacing",
+    "shown",
     "write_file",
     "writing",
 ]
@@ -55,6 +56,8 @@ LONGEST_NAME: Final = 255
 """Bytes of a file name that every file system takes."""
 _BEGINNING: Final = 40
 """Characters of a long file name, of up to four bytes each, that its temporary name keeps."""
+_MOST_SHOWN: Final = 200
+"""Characters of a value that a message shows."""
 
 
 class TriLiteNetError(Exception):
@@ -100,6 +103,15 @@ class TrainingError(TriLiteNetError, RuntimeError):
 def brief(error: BaseException) -> str:
     """Return an error's kind and words for a message: its ``repr``, which of a decoding error is the whole file."""
     return f"{type(error).__name__}: {error}" if isinstance(error, UnicodeError) else repr(error)
+
+
+def shown(value: object) -> str:
+    """Return the ``repr`` of a value for a message, which of a whole list or text would not be one line to read."""
+    try:
+        text = repr(value)
+    except ValueError:  # a whole number that Python does not write
+        return "a number of thousands of digits"
+    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]} ..."
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -17,7 +17,15 @@ from trilitenet.data.description import (
     read_description,
     write_description,
 )
-from trilitenet.data.reading import DrivingDataset, MixedDataset, decode_image, decode_mask, is_crowd, sampling_weights
+from trilitenet.data.reading import (
+    DrivingDataset,
+    MixedDataset,
+    decode_image,
+    decode_mask,
+    is_crowd,
+    parse_annotation,
+    sampling_weights,
+)
 from trilitenet.data.sample import Sample
 from trilitenet.errors import DataError, ShapeError
 
@@ -261,6 +269,12 @@ def test_files_that_cannot_be_read_are_named(root: Path) -> None:
     dataset.image_path(2).unlink()
     with pytest.raises(DataError, match=r"train_0002\.\w+: the image is not there any more"):
         dataset[2]
+
+
+def test_a_number_that_no_float_is_makes_a_broken_annotation() -> None:
+    box = {"category": "car", "box2d": {"x1": 0, "y1": 0, "x2": 10**400, "y2": 9}}
+    with pytest.raises(DataError, match=r"^x\.json: not an annotation in the per-image form"):
+        parse_annotation({"frames": [{"objects": [box]}]}, {"car": 0}, (), (9, 9), "x.json")
 
 
 def test_an_image_of_an_absurd_size_is_a_broken_one() -> None:

@@ -114,6 +114,8 @@ def test_a_part_that_is_not_there_is_a_task_that_is_not_scored(tmp_path: Path) -
         ('[{"image_id": "a", "category_id": 3, "bbox": [0, 0, 1, 1], "score": 0.5}]', "category_id 3 is not 1 to 2"),
         ("[{", "not COCO results"),
         ("", "not COCO results"),
+        ('[{"image_id": "a", "category_id": Infinity, "bbox": [0, 0, 1, 1], "score": 0.5}]', "not COCO results"),
+        pytest.param("[" * 20_000, "nested too deeply", id="deep"),
     ],
 )
 def test_broken_detections_are_told_in_a_line(tmp_path: Path, content: str, message: str) -> None:

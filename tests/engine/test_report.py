@@ -84,6 +84,10 @@ def test_what_is_no_report_is_refused(tmp_path: Path, report: Report) -> None:
         path.write_text(content)
         with pytest.raises(DataError, match="not a report"):
             read_report(path)
+    figure = {"value": 10**400, "low": None, "high": None}
+    path.write_text(json.dumps(report.to_dict() | {"figures": {"fair/lane/iou": figure}}))
+    with pytest.raises(DataError, match="not a report"):
+        read_report(path)
     path.write_text(json.dumps(report.to_dict() | {"schema": 99}))
     with pytest.raises(DataError, match="newer"):
         read_report(path)

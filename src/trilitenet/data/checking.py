@@ -11,7 +11,6 @@ import functools
 import hashlib
 import io
 import itertools
-import json
 import math
 import mmap
 from collections import Counter, defaultdict
@@ -23,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from trilitenet.config import DEFAULT_ANCHORS, LONG_SIDE, Anchors
+from trilitenet.config import DEFAULT_ANCHORS, LONG_SIDE, Anchors, parse_json
 from trilitenet.data.description import DatasetDescription, MaskMeaning, class_table, read_description
 from trilitenet.data.prepared import is_prepared
 from trilitenet.data.reading import (
@@ -420,7 +419,7 @@ def _look_at_boxes(
 ) -> tuple[dict[str, int], NDArray[np.float32], dict[str, str]]:
     where = path.relative_to(job.root).as_posix()
     try:
-        content = json.loads(path.read_bytes())
+        content = parse_json(path.read_bytes())
         items = [item for frame in content["frames"] for item in (frame.get("objects") or ())]
         attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
         labels = [(str(item["category"]), item.get("box2d"), is_crowd(item)) for item in items]
@@ -438,7 +437,7 @@ def _look_at_boxes(
             faults.append(("category-unknown", place))
         try:
             x1, y1, x2, y2 = (float(box[key]) for key in ("x1", "y1", "x2", "y2"))
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             faults.append(("box-invalid", place))
             continue
         if not (math.isfinite(x1 + y1 + x2 + y2) and x2 > x1 and y2 > y1):

@@ -16,7 +16,6 @@ from __future__ import annotations
 import csv
 import functools
 import hashlib
-import json
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import Task
+from trilitenet.config import Task, parse_json
 from trilitenet.data.description import DatasetDescription, MaskMeaning, class_table, read_description
 from trilitenet.data.sample import Sample
 from trilitenet.errors import DataError, brief, did_you_mean
@@ -172,7 +171,7 @@ def parse_annotation(
                     boxes.append((x1, y1, x2, y2))
                     class_id.append(table[category])
         attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise DataError(f"{name}: not an annotation in the per-image form ({brief(error)})") from error
     return (
         np.array(boxes, np.float32).reshape(-1, 4),
@@ -343,7 +342,7 @@ class DrivingDataset:
         if data is None:
             return None
         try:
-            return json.loads(data.tobytes())
+            return parse_json(data.tobytes())
         except ValueError as error:
             raise DataError(f"{path}: not JSON ({error})") from error
 

@@ -204,7 +204,7 @@ class SavedPredictions:
                     raise DataError(f"{path}: a score must be between 0 and 1, got {score}")
                 image = index.setdefault(str(entry["image_id"]), len(index))
                 numbers.extend((image, left, top, left + width, top + height, score, number))
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             if isinstance(error, DataError):
                 raise
             form = "a list of image_id, category_id, bbox, score"
@@ -231,7 +231,7 @@ def _entries(text: str) -> Iterator[dict[str, Any]]:
     """Yield the members of a JSON list one at a time, so that millions of boxes never are as many dictionaries.
 
     Raises:
-        ValueError: If it is not a JSON list.
+        ValueError: If it is not a JSON list, or is nested too deeply.
     """
     decoder = json.JSONDecoder()
     gap = re.compile(r"[\s,]*")
@@ -243,5 +243,8 @@ def _entries(text: str) -> Iterator[dict[str, Any]]:
         at = gap.match(text, at).end()  # type: ignore[union-attr]
         if text[at : at + 1] == "]":
             return
-        entry, at = decoder.raw_decode(text, at)
+        try:
+            entry, at = decoder.raw_decode(text, at)
+        except RecursionError as error:
+            raise ValueError("nested too deeply") from error
         yield entry

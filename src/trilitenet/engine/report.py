@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from trilitenet.config import parse_json
 from trilitenet.engine.figures import CONDITION_FIGURES, HEADLINES, meaning
 from trilitenet.engine.page import percent
 from trilitenet.engine.scoring import FairMetrics, FairScores, PaperMetrics, PaperScores
@@ -373,7 +374,7 @@ def read_report(path: Path) -> Report:
         DataError: If it is no report, or a newer one.
     """
     try:
-        mapping = json.loads(path.read_bytes())
+        mapping = parse_json(path.read_bytes())
         schema = mapping["schema"]
         if not isinstance(schema, int) or schema > REPORT_SCHEMA:
             raise DataError(f"{path}: report schema {schema!r} is newer than {REPORT_SCHEMA}; upgrade trilitenet")
@@ -418,7 +419,7 @@ def read_report(path: Path) -> Report:
         )
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         if isinstance(error, DataError):
             raise
         raise DataError(f"{path}: not a report that `trilitenet evaluate` wrote ({brief(error)})") from error

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import WEIGHTS_HASH_KEY, ArtefactInfo, ModelCard
+from trilitenet.config import WEIGHTS_HASH_KEY, ArtefactInfo, ModelCard, parse_json
 from trilitenet.errors import BackendError, ConfigError, WeightsError, import_extra
 from trilitenet.inference.backend import ParallelSessions, check_process
 from trilitenet.inference.exported import prepare_input, read_metadata, run_images
@@ -149,7 +149,7 @@ def _read(path: Path) -> tuple[ModelCard, ArtefactInfo]:
         if start.read(len(_MAGIC)) != _MAGIC:
             raise WeightsError(f"{path}: not a usable NCNN model (it does not begin as one)")
     try:
-        found = json.loads(side.read_text(encoding="utf-8"))
+        found = parse_json(side.read_text(encoding="utf-8"))
     except ValueError as error:
         raise WeightsError(f"{side}: not JSON ({error})") from error
     if not isinstance(found, dict):

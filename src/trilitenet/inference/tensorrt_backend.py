@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard, parse_json
 from trilitenet.errors import BackendError, WeightsError, import_extra
 from trilitenet.inference.exported import prepare_input, read_metadata, run_images
 from trilitenet.structures import RawOutputs
@@ -45,7 +45,7 @@ def unpack_engine(path: Path) -> tuple[ModelCard, ArtefactInfo, bytes]:
         raise WeightsError(f"{path}: not an engine of ours; build it with: trilitenet export --format tensorrt")
     (length,) = struct.unpack("<I", data[len(MAGIC) : start])
     try:
-        header = json.loads(data[start : start + length])
+        header = parse_json(data[start : start + length])
     except ValueError as error:
         raise WeightsError(f"{path}: its header is broken ({error})") from error
     if not isinstance(header, dict):

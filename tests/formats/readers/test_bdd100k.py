@@ -137,6 +137,9 @@ def test_errors_name_the_file(tmp_path: Path) -> None:
     path.write_text(path.read_text()[:-40])
     with pytest.raises(DataError, match=r"bdd100k_labels_images_train\.json"):
         read_bdd100k(tmp_path)
+    path.write_text('[{"name": ' + "[" * 20_000)
+    with pytest.raises(DataError, match="nested too deeply"):
+        read_bdd100k(tmp_path)
     path.write_text('"hello"')
     with pytest.raises(DataError, match="neither a list"):
         read_bdd100k(tmp_path)
@@ -144,6 +147,9 @@ def test_errors_name_the_file(tmp_path: Path) -> None:
         parse_labels({"hello": 1}, Path("x.jpg"), "x.json")
     with pytest.raises(DataError, match="not as BDD100K has it"):
         parse_labels({"labels": [{"category": "car", "box2d": {"x1": 1}}]}, Path("x.jpg"), "x.json")
+    box = {"x1": 1, "y1": 1, "x2": 10**400, "y2": 2}
+    with pytest.raises(DataError, match="not as BDD100K has it"):
+        parse_labels({"labels": [{"category": "car", "box2d": box}]}, Path("x.jpg"), "x.json")
 
 
 @pytest.mark.parametrize(

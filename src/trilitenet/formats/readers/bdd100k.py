@@ -24,7 +24,7 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from trilitenet.config import TASKS, Task
+from trilitenet.config import TASKS, Task, parse_json
 from trilitenet.data.rasterise import flatten
 from trilitenet.data.reading import IMAGE_ENDINGS, is_crowd
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel, same_name
@@ -211,7 +211,7 @@ def parse_labels(content: Any, image: Path, source: str, tasks: Collection[Task]
         for item in _items(content):
             _parse_item(item, objects, areas, lanes, dropped)
         attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise DataError(f"{source}: {image.stem}: {brief(error)} is not as BDD100K has it") from error
     return ImageRecord(
         name=image.stem,
@@ -325,7 +325,7 @@ def _entries(files: _Split, name: str) -> Iterator[tuple[Any, Path]]:
 
 def _parse(text: bytes, path: Path) -> Any:
     try:
-        return json.loads(text)
+        return parse_json(text)
     except ValueError as error:
         raise DataError(f"{path}: not JSON ({brief(error)})") from error
 
@@ -364,7 +364,7 @@ def _tasks_of_documents(folder: Path) -> frozenset[Task]:
         if len(tasks) == len(TASKS):
             break
         try:
-            entry = json.loads(path.read_bytes())
+            entry = parse_json(path.read_bytes())
         except ValueError:
             continue
         if isinstance(entry, dict):
@@ -421,6 +421,8 @@ def _index(path: Path) -> Iterator[tuple[str, _Part, dict[str, Any]]]:
                     raise DataError(f"{path}: not JSON near byte {base + position} ({error.msg})") from error
                 text, base, position = text[position:] + more, base + position, 0
                 continue
+            except RecursionError as error:
+                raise DataError(f"{path}: not JSON near byte {base + position} (nested too deeply)") from error
             if not isinstance(entry, dict) or "name" not in entry:
                 raise DataError(f"{path}: an entry without 'name' near byte {base + position}")
             if not str(entry["name"]).isascii():

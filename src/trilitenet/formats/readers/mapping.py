@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import re
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -11,7 +10,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import Task, check_tasks, parse, read_yaml
+from trilitenet.config import Task, check_tasks, parse, parse_json, read_yaml
 from trilitenet.data.description import VEHICLES
 from trilitenet.data.records import AreaLabel, LaneLabel, ObjectLabel, RunLabel
 from trilitenet.errors import ConfigError, DataError, brief
@@ -216,7 +215,7 @@ def read_json(path: Path) -> Any:
         DataError: If it is missing or broken.
     """
     try:
-        return json.loads(path.read_bytes())
+        return parse_json(path.read_bytes())
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     except ValueError as error:
