@@ -238,6 +238,8 @@ ARTEFACT_KEY: Final = "trilitenet.artefact"
 """Key of the artefact's description in an exported file's metadata."""
 WEIGHTS_HASH_KEY: Final = "trilitenet.weights_sha256"
 """Key of the SHA-256 of an artefact's weights, where these and the metadata are files of their own."""
+GRAPH_HASH_KEY: Final = "trilitenet.graph_sha256"
+"""Key of the SHA-256 of an artefact's graph, where that and the metadata are files of their own."""
 ARTEFACT_SCHEMA: Final = 1
 """Version of the artefact's description; a file with a higher one is refused."""
 ARTEFACT_SUFFIXES: Final = {

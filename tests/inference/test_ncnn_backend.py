@@ -15,7 +15,7 @@ import pytest
 
 import trilitenet
 from tests.artefacts import SIZE, Artefacts
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, GRAPH_HASH_KEY
 from trilitenet.errors import BackendError, ConfigError, ShapeError, WeightsError
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.ncnn_backend import NcnnBackend
@@ -99,7 +99,7 @@ def test_a_file_that_is_missing_or_broken_is_one_line(copied: Path, suffix: str)
     file = copied.with_suffix(suffix)
     content = file.read_bytes()
     # Cut short, foreign, and for the layers, whole at the start but not to the end.
-    reasons = {".param": "not a usable NCNN model", ".bin": "not the weights", ".json": "not JSON"}
+    reasons = {".param": "not a usable NCNN model|not the graph", ".bin": "not the weights", ".json": "not JSON"}
     for broken in (content[: len(content) // 2], b"not a model\n" * 20, b""):
         file.write_bytes(broken)
         with pytest.raises(WeightsError, match=reasons[suffix]) as caught:
@@ -129,7 +129,19 @@ def test_foreign_and_newer_metadata_is_refused(copied: Path, change: Change, mes
     assert "\n" not in str(caught.value)
 
 
-def test_a_graph_of_other_names_is_refused(copied: Path) -> None:
+def test_a_piece_of_a_graph_is_refused(copied: Path) -> None:
+    lines = copied.read_text(encoding="utf-8").splitlines(keepends=True)
+    copied.write_text("".join(lines[: len(lines) // 2]), encoding="utf-8")
+    with pytest.raises(WeightsError, match=r"model\.ncnn\.param: not the graph that model\.ncnn\.json was written for"):
+        NcnnBackend(copied)
+
+
+def test_the_graph_of_an_earlier_version_has_no_hash(copied: Path) -> None:
+    side = copied.with_suffix(".json")
+    found = json.loads(side.read_text(encoding="utf-8"))
+    del found[GRAPH_HASH_KEY]
+    side.write_text(json.dumps(found), encoding="utf-8")
+    assert NcnnBackend(copied).card.classes == 2
     copied.write_text(copied.read_text(encoding="utf-8").replace(" lane ", " road "), encoding="utf-8")
     with pytest.raises(WeightsError, match="has no lane"):
         NcnnBackend(copied)

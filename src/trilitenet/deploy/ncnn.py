@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 
 import torch
 
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY, WEIGHTS_HASH_KEY, ArtefactInfo, ModelCard
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, GRAPH_HASH_KEY, WEIGHTS_HASH_KEY, ArtefactInfo, ModelCard
 from trilitenet.deploy.graph import DeployGraph, Traceable
 from trilitenet.errors import BackendError, import_extra, writing
 
@@ -88,11 +88,13 @@ def save_ncnn(model: NcnnModel, path: Path, card: ModelCard, info: ArtefactInfo)
         card: What the network is.
         info: How the artefact takes pixels and returns results.
     """
-    path.write_text(model.param, encoding="utf-8")
+    graph = model.param.encode()
+    path.write_bytes(graph)
     path.with_suffix(".bin").write_bytes(model.weights)
     metadata = {
         CARD_KEY: json.loads(card.to_json()),
         ARTEFACT_KEY: json.loads(info.to_json()),
+        GRAPH_HASH_KEY: hashlib.sha256(graph).hexdigest(),
         WEIGHTS_HASH_KEY: hashlib.sha256(model.weights).hexdigest(),
     }
     path.with_suffix(".json").write_text(json.dumps(metadata, indent=2) + "\n", encoding="utf-8")

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import WEIGHTS_HASH_KEY, ArtefactInfo, ModelCard, parse_json
+from trilitenet.config import GRAPH_HASH_KEY, WEIGHTS_HASH_KEY, ArtefactInfo, ModelCard, parse_json
 from trilitenet.errors import BackendError, ConfigError, WeightsError, import_extra
 from trilitenet.inference.backend import ParallelSessions, check_process
 from trilitenet.inference.exported import prepare_input, read_metadata, run_images
@@ -155,6 +155,10 @@ def _read(path: Path) -> tuple[ModelCard, ArtefactInfo]:
     if not isinstance(found, dict):
         raise WeightsError(f"{side}: not the metadata of an artefact (not an object)")
     card, info = read_metadata({key: json.dumps(value) for key, value in found.items()}, str(side))
-    if hashlib.sha256(weights.read_bytes()).hexdigest() != found.get(WEIGHTS_HASH_KEY):
-        raise WeightsError(f"{weights}: not the weights that {side.name} was written for; export the model again")
+    parts = [(weights, "weights", WEIGHTS_HASH_KEY)]
+    if GRAPH_HASH_KEY in found:  # earlier versions wrote none
+        parts.append((path, "graph", GRAPH_HASH_KEY))  # of which NCNN takes a piece for a whole one
+    for file, what, key in parts:
+        if hashlib.sha256(file.read_bytes()).hexdigest() != found.get(key):
+            raise WeightsError(f"{file}: not the {what} that {side.name} was written for; export the model again")
     return card, info
