@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 import pickle
+import re
 import shutil
 import subprocess
 import sys
@@ -300,6 +301,34 @@ def test_foreign_and_newer_artefacts_are_refused(artefacts: Artefacts, tmp_path:
     newer = json.dumps(json.loads(metadata[CARD_KEY]) | {"schema": 99})
     with pytest.raises(WeightsError, match="upgrade trilitenet"):
         kind(with_metadata(metadata | {CARD_KEY: newer}))
+
+
+@pytest.mark.parametrize("kind", [OnnxBackend, OpenVINOBackend])
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "message"),
+    [
+        ([1], ["detection"], "its graph has no drivable, lane;"),
+        ([1, 1], ["detection", "drivable"], "describe an input of (64, 128), the graph takes [1, 64, 128, 3], [1, 64,"),
+        ([100], ["detection"], "describe an input of (64, 128), the graph takes [1, 6400, 128, 3];"),
+    ],
+    ids=["outputs", "inputs", "size"],
+)
+def test_a_graph_other_than_its_metadata_is_refused(
+    artefacts: Artefacts, tmp_path: Path, kind: Any, inputs: list[int], outputs: list[str], message: str
+) -> None:
+    onnx = pytest.importorskip("onnx")
+    helper, byte = onnx.helper, onnx.TensorProto.UINT8
+    takes = [helper.make_tensor_value_info(f"in{i}", byte, [1, 64 * n, 128, 3]) for i, n in enumerate(inputs)]
+    gives = [helper.make_tensor_value_info(name, byte, None) for name in outputs]
+    nodes = [helper.make_node("Identity", [f"in{i % len(inputs)}"], [name]) for i, name in enumerate(outputs)]
+    model = helper.make_model(
+        helper.make_graph(nodes, "g", takes, gives), ir_version=8, opset_imports=[helper.make_opsetid("", 17)]
+    )
+    metadata = onnx.load(str(artefacts.folder / "model.onnx")).metadata_props
+    helper.set_model_props(model, {entry.key: entry.value for entry in metadata})
+    onnx.save(model, str(tmp_path / "foreign.onnx"))
+    with pytest.raises(WeightsError, match=re.escape(message)):
+        kind(tmp_path / "foreign.onnx")
 
 
 def test_openvino_without_its_weights_file(artefacts: Artefacts, tmp_path: Path) -> None:

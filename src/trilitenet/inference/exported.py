@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from trilitenet.errors import BackendError, ShapeError, TriLiteNetError, Weights
 from trilitenet.inference.backend import check_batch
 from trilitenet.structures import RawOutputs
 
-__all__ = ["is_int8_onnx", "prepare_input", "read_metadata", "run_images"]
+__all__ = ["check_graph", "is_int8_onnx", "prepare_input", "read_metadata", "run_images"]
 
 _METADATA_BYTES = 1 << 16
 
@@ -35,6 +35,34 @@ def read_metadata(metadata: Mapping[str, str], source: str) -> tuple[ModelCard, 
         if key not in metadata:
             raise WeightsError(f"{source}: no {key!r} in its metadata; export it with: trilitenet export")
     return ModelCard.from_json(metadata[CARD_KEY], source), ArtefactInfo.from_json(metadata[ARTEFACT_KEY], source)
+
+
+def check_graph(
+    inputs: Sequence[Sequence[int | None]], outputs: Collection[str], card: ModelCard, info: ArtefactInfo, source: str
+) -> None:
+    """Refuse a graph that is another than the metadata beside it describes.
+
+    Args:
+        inputs: The shape of each of its inputs; None for a side that is dynamic.
+        outputs: The names of its outputs.
+        card: Its tasks say which outputs there must be.
+        info: The size it must take.
+        source: The file, for messages.
+
+    Raises:
+        WeightsError: If it has not one input of that size, or lacks an output.
+    """
+    shape = inputs[0] if len(inputs) == 1 else ()
+    sides = tuple(shape[1:3] if info.input == "uint8_nhwc" else shape[2:4])
+    size = info.size or (None, None)
+    missing = [task for task in card.tasks if task not in outputs]
+    if len(shape) != 4 or any(side not in (None, wanted) for side, wanted in zip(sides, size, strict=True)):
+        raise WeightsError(
+            f"{source}: its metadata describe an input of {'any size' if info.size is None else info.size}, the graph "
+            f"takes {', '.join(str(list(shape)) for shape in inputs) or 'none'}; the file is damaged or foreign"
+        )
+    if missing:
+        raise WeightsError(f"{source}: its graph has no {', '.join(missing)}; the file is damaged or foreign")
 
 
 def is_int8_onnx(path: str | os.PathLike[str]) -> bool:

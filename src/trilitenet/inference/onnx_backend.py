@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from trilitenet.config import ModelCard
 from trilitenet.errors import BackendError, WeightsError, import_extra
 from trilitenet.inference.backend import ParallelSessions
-from trilitenet.inference.exported import prepare_input, read_metadata, run_images
+from trilitenet.inference.exported import check_graph, prepare_input, read_metadata, run_images
 from trilitenet.structures import RawOutputs
 
 __all__ = ["OnnxBackend"]
@@ -53,8 +53,11 @@ class OnnxBackend(ParallelSessions):
         self._runtime, self._path, self._providers, self._threads = runtime, path, providers, threads
         self._session = self._open(threads)
         self._card, self.info = read_metadata(self._session.get_modelmeta().custom_metadata_map, str(path))
-        self._input = self._session.get_inputs()[0].name
+        inputs = self._session.get_inputs()
         self._outputs = [output.name for output in self._session.get_outputs()]
+        shapes = [[side if isinstance(side, int) else None for side in each.shape] for each in inputs]
+        check_graph(shapes, self._outputs, self._card, self.info, str(path))
+        self._input = inputs[0].name
         self._device = "cuda" if self._session.get_providers()[0].startswith("CUDA") else "cpu"
 
     def _open(self, threads: int | None) -> Any:

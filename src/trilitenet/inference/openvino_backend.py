@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ModelCard
 from trilitenet.errors import BackendError, ConfigError, WeightsError, import_extra
 from trilitenet.inference.backend import MOST_PARALLEL, check_process, replaced
-from trilitenet.inference.exported import prepare_input, read_metadata, run_images
+from trilitenet.inference.exported import check_graph, prepare_input, read_metadata, run_images
 from trilitenet.processing.cores import usable_cores
 from trilitenet.structures import RawOutputs
 
@@ -82,6 +82,12 @@ class OpenVINOBackend:
                 reason = f"{weights.name} is cut off, or of another file; export it again"
             raise WeightsError(f"{path}: not a usable OpenVINO or ONNX model ({reason})") from error
         self._card, self.info = read_metadata(_metadata(model), str(path))
+        shapes = [
+            [] if each.rank.is_dynamic else [None if side.is_dynamic else side.get_length() for side in each]
+            for each in (entry.partial_shape for entry in model.inputs)
+        ]
+        names = {name for output in model.outputs for name in output.names}
+        check_graph(shapes, names, self._card, self.info, str(path))
         if path.suffix.lower() == ".onnx" and self.info.precision == "int8":
             # Its low-precision passes change what such a graph computes: tiny lost 9.7 points of AP50 by them.
             raise BackendError(
