@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import inspect
+import io
 import os
 import re
 import signal
@@ -36,8 +37,8 @@ def greet(monkeypatch: pytest.MonkeyPatch) -> list[object]:
             loudness: How loud.
         """
         calls.append((name, loudness))
-        if name == "nobody":
-            raise OutputError("nobody: cannot be greeted")
+        if name.startswith("nobody"):
+            raise OutputError(f"{name}: cannot be greeted")
         if name == "somebody":
             raise OSError("as nobody foresaw")
         if name in {"ctrl-c", "sigterm"}:
@@ -77,6 +78,22 @@ def test_an_error_is_one_line(greet: list[object], capsys: pytest.CaptureFixture
 def test_what_nobody_foresaw_is_not_taken_for_a_full_output(greet: list[object]) -> None:
     with pytest.raises(OSError, match="as nobody foresaw"):
         cli.main(["greet", "somebody"])
+
+
+def test_a_name_in_an_error_breaks_no_line_and_controls_no_terminal(
+    greet: list[object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["greet", "nobody é\n\x1b[31m\u2028"]) == 1
+    assert capsys.readouterr().err == "error: nobody é\\n\\x1b[31m\\u2028: cannot be greeted\n"
+
+
+def test_what_standard_output_cannot_encode_is_no_traceback(
+    greet: list[object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(stream, encoding="latin-1"))
+    assert cli.main(["greet", "─ é \udc80"]) == 0
+    assert stream.getvalue() == b"hello ? \xe9 ?\n"
 
 
 @pytest.fixture

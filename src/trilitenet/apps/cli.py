@@ -14,6 +14,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import importlib
+import io
 import logging
 import os
 import re
@@ -92,6 +93,8 @@ GROUPS: Final = {
 }
 """Words that gather commands, with their help."""
 
+_CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+"""Characters that end a line or control a terminal."""
 _ROOT_OPTIONS: Final = ("--help", "-h", "--version")
 
 
@@ -313,6 +316,8 @@ def _show(result: object) -> None:
         OutputError: If standard output takes no more.
     """
     text = result.summary() if hasattr(result, "summary") else result
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a terminal or a pipe of another encoding lacks the rules of tables
     try:
         sys.stdout.write(f"{text}\n" if isinstance(text, str) and text else "")
         sys.stdout.flush()
@@ -322,7 +327,7 @@ def _show(result: object) -> None:
         raise OutputError(_output_failed(error)) from error
     finally:
         for line in getattr(result, "errors", ()):
-            sys.stderr.write(f"error: {line}\n")
+            _tell(line)
 
 
 def _output_failed(error: OSError) -> str:
@@ -337,5 +342,11 @@ def _discard_output() -> None:
 
 
 def _fail(message: str, code: int) -> int:
-    sys.stderr.write(f"error: {message}\n")
+    _tell(message)
     return code
+
+
+def _tell(message: str) -> None:
+    """Write an error as one line that does nothing to the terminal, whatever the names of files in it hold."""
+    shown = _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), message)
+    sys.stderr.write(f"error: {shown}\n")
