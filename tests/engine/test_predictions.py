@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import time
+import zlib
 from pathlib import Path
 
 import cv2
@@ -124,6 +125,11 @@ def test_broken_detections_are_told_in_a_line(tmp_path: Path, content: str, mess
         SavedPredictions(tmp_path, ("car", "bus"))
 
 
+def test_a_mark_before_the_list_is_no_part_of_it(tmp_path: Path) -> None:
+    (tmp_path / "detections.json").write_text("\ufeff[]", encoding="utf-8")
+    assert SavedPredictions(tmp_path, ("car",)).names == set()
+
+
 def test_masks_must_be_there_and_fit(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no predictions"):
         SavedPredictions(tmp_path, ("vehicle",))
@@ -132,6 +138,13 @@ def test_masks_must_be_there_and_fit(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="missing"):
         saved.get("a", (4, 4))
     (tmp_path / "lane" / "a.png").write_bytes(b"")
+    with pytest.raises(DataError, match="decoded"):
+        saved.get("a", (4, 4))
+    picture = cv2.imencode(".png", np.zeros((4, 4), np.uint8))[1].tobytes()
+    side = (100_000).to_bytes(4, "big")
+    header = b"IHDR" + side + side + picture[24:29]
+    absurd = picture[:12] + header + zlib.crc32(header).to_bytes(4, "big") + picture[33:]
+    (tmp_path / "lane" / "a.png").write_bytes(absurd)
     with pytest.raises(DataError, match="decoded"):
         saved.get("a", (4, 4))
     cv2.imwrite(str(tmp_path / "lane" / "a.png"), np.zeros((4, 5), np.uint8))

@@ -41,6 +41,7 @@ __all__ = [
     "DrivingDataset",
     "MixedDataset",
     "SampleSource",
+    "decode",
     "decode_image",
     "decode_mask",
     "is_crowd",
@@ -91,14 +92,17 @@ def decode_image(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8
         DataError: If it is not an image, or a broken one.
     """
     buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes) else data
-    image = _decode(buffer, _READ_RGB or cv2.IMREAD_COLOR)
+    image = decode(buffer, _READ_RGB or cv2.IMREAD_COLOR)
     if image is None:
         raise DataError(f"{name}: not an image that can be decoded; run `trilitenet data check` on the data set")
     return np.asarray(image if _READ_RGB else cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image), np.uint8)
 
 
-def _decode(buffer: NDArray[np.uint8], mode: int) -> NDArray[Any] | None:
-    """Decode by OpenCV, which returns None for most of what it cannot read, but refuses absurd sizes by an error."""
+def decode(buffer: NDArray[np.uint8], mode: int) -> NDArray[Any] | None:
+    """Decode an encoded image by OpenCV, in one of its modes; None if it cannot be read.
+
+    OpenCV itself returns None for most of what it cannot read, but refuses absurd sizes by an error.
+    """
     try:
         return cv2.imdecode(buffer, mode) if len(buffer) else None
     except cv2.error:
@@ -114,7 +118,7 @@ def decode_mask(
         DataError: If it is not an image, or a broken one.
     """
     buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes) else data
-    grey = _decode(buffer, cv2.IMREAD_GRAYSCALE)
+    grey = decode(buffer, cv2.IMREAD_GRAYSCALE)
     if grey is None:
         raise DataError(f"{name}: not a mask that can be decoded; run `trilitenet data check` on the data set")
     if not meaning.ignore:

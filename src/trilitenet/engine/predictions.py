@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import TASKS, Task
+from trilitenet.data.reading import decode
 from trilitenet.errors import DataError, OutputError, brief, part_of, writing
 from trilitenet.structures import Boxes, Perception
 
@@ -182,7 +183,7 @@ class SavedPredictions:
         path = self.folder / task / f"{name}.png"
         if not path.is_file():
             raise DataError(f"{path}: missing; every image needs a mask (an empty one where nothing is predicted)")
-        grey = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE) if path.stat().st_size else None
+        grey = decode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
         if grey is None:
             raise DataError(f"{path}: not an image that can be decoded")
         if grey.shape != size:
@@ -194,7 +195,7 @@ class SavedPredictions:
         numbers = array.array("d")  # an entry: image, left, top, right, bottom, score, class
         index: dict[str, int] = {}
         try:
-            for entry in _entries(path.read_text(encoding="utf-8")):
+            for entry in _entries(path.read_text(encoding="utf-8-sig")):  # editors put a mark before it
                 left, top, width, height = (float(value) for value in entry["bbox"])
                 number = self._class(int(entry["category_id"]), path)
                 if not all(map(math.isfinite, (left, top, width, height))):

@@ -103,6 +103,9 @@ def test_errors(tmp_path: Path) -> None:
     path.write_text(json.dumps(coco()))
     with pytest.raises(DataError, match="none of the images"):
         read_coco(path)
+    path.write_text(json.dumps(coco(images=[{"id": 7, "file_name": "x" * 5000}])))
+    with pytest.raises(DataError, match="none of the images"):
+        read_coco(path)
     path.write_text(json.dumps(coco(annotations=[{"hello": 1}])))
     cv2.imwrite(str(tmp_path / "one.png"), np.zeros((*SIZE, 3), np.uint8))
     with pytest.raises(DataError, match="not as COCO has it"):

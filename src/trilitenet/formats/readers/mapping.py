@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import re
 from pathlib import Path
@@ -233,6 +234,7 @@ def find_image(name: str, folders: list[Path]) -> Path | None:
     for candidate in (name, Path(name).name):
         for folder in folders:
             path = folder / candidate
-            if path.is_file():
-                return path
+            with contextlib.suppress(OSError):  # a name that is too long is none of a file
+                if path.is_file():
+                    return path
     return None
