@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import time
 import zlib
 from pathlib import Path
 
@@ -27,16 +26,6 @@ def perception(rng: np.random.Generator, boxes: int) -> Perception:
         rng.random((40, 50)) < 0.5,
         rng.random((40, 50)) < 0.1,
     )
-
-
-def test_asking_for_one_of_many_images_takes_no_time(tmp_path: Path) -> None:
-    entry = {"category_id": 1, "bbox": [0, 0, 9, 9], "score": 0.5}
-    entries = [{"image_id": str(number), **entry} for number in range(20_000)]
-    (tmp_path / "detections.json").write_text(json.dumps(entries))
-    saved = SavedPredictions(tmp_path, ("vehicle",))
-    begun = time.process_time()
-    assert sum(str(number) in saved.names for number in range(4_000)) == 4_000
-    assert time.process_time() - begun < 0.5
 
 
 def test_what_is_written_is_read_again(tmp_path: Path, rng: np.random.Generator) -> None:
