@@ -20,7 +20,7 @@ import torch
 import yaml
 
 import trilitenet
-from trilitenet.commands.train import _Display, train, validation_figures
+from trilitenet.commands.train import _display, train, validation_figures
 from trilitenet.commands.train_table import train_table
 from trilitenet.config import DEFAULT_ANCHORS, TASKS
 from trilitenet.data.description import read_description, write_description
@@ -322,7 +322,8 @@ def test_a_stop_while_the_network_is_measured_waits_for_no_more_images(
     assert curves(tmp_path / "straight") == curves(tmp_path / "parts")
 
 
-def test_a_terminal_shows_how_far_validation_is(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("what", ["validation", "anchors"])
+def test_a_terminal_shows_how_far_the_images_are(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
     class Terminal(io.StringIO):
         def isatty(self) -> bool:
             return True
@@ -331,11 +332,11 @@ def test_a_terminal_shows_how_far_validation_is(monkeypatch: pytest.MonkeyPatch)
     shown = []
     for images in (30, 2):
         monkeypatch.setattr("sys.stderr", Terminal())
-        with _Display(quiet=False) as display:
+        with _display(quiet=False) as display:
             display.step(5, 6, "epoch 1/1 step 5/6: total 1.0")
-            display.validation(images, 30)
+            getattr(display, what)(images, 30)
         assert isinstance(sys.stderr, Terminal)
-        shown.append(re.search(r"validation.*\b2/30", sys.stderr.getvalue()) is not None)
+        shown.append(re.search(rf"{what}.*\b2/30", sys.stderr.getvalue()) is not None)
     assert shown == [False, True]  # gone at the end
 
 

@@ -88,7 +88,10 @@ class _Source:
 
 
 def test_sizes_are_in_input_pixels() -> None:
-    assert box_sizes(_Source(), (384, 640)).tolist() == [[50.0, 20.0]]
+    told: list[tuple[int, int]] = []
+    sizes = box_sizes(_Source(), (384, 640), progress=lambda done, count: told.append((done, count)))
+    assert sizes.tolist() == [[50.0, 20.0]]
+    assert told == [(number, len(_Source())) for number in range(1, len(_Source()) + 1)]
 
 
 def test_the_published_sizes_are_tall() -> None:

@@ -253,7 +253,7 @@ def _network(config: TrainConfig, dataset: SampleSource, display: _Display, *, r
     initial = load_network(config.init) if config.init is not None and not resume else None
     if config.auto_anchor and anchors is None and "detection" in config.tasks and not resume:
         swapped = config.swapped_anchors
-        sizes = box_sizes(dataset, config.input_size, seed=config.seed, swapped=swapped)
+        sizes = box_sizes(dataset, config.input_size, seed=config.seed, swapped=swapped, progress=display.anchors)
         enough = math.inf if swapped else config.anchor_recall
         # Weights that are taken over were trained with anchors of their own: those are kept where they fit.
         before = DEFAULT_ANCHORS if initial is None or "detection" not in initial.tasks else initial.card.anchors
@@ -370,7 +370,7 @@ class _Display:
     def __init__(self, progress: Progress, *, quiet: bool) -> None:
         self._progress, self._quiet = progress, quiet
         self._task = progress.add_task("", total=None, what="step")
-        self._validation: TaskID | None = None
+        self._second: TaskID | None = None
 
     def line(self, text: str) -> None:
         """Show a line that stays."""
@@ -387,12 +387,20 @@ class _Display:
 
     def validation(self, images: int, count: int) -> None:
         """Show how many images the network has been measured on, and of how many."""
-        if self._validation is None:
-            self._validation = self._progress.add_task("", what="validation")
-        self._progress.update(self._validation, completed=images, total=count)
-        if images == count:
-            self._progress.remove_task(self._validation)
-            self._validation = None
+        self._aside("validation", images, count)
+
+    def anchors(self, images: int, count: int) -> None:
+        """Show of how many images the boxes have been read, and of how many they will be."""
+        self._aside("boxes for anchors", images, count)
+
+    def _aside(self, what: str, done: int, count: int) -> None:
+        """Show a second bar until it is full."""
+        if self._second is None:
+            self._second = self._progress.add_task("", what=what)
+        self._progress.update(self._second, completed=done, total=count)
+        if done == count:
+            self._progress.remove_task(self._second)
+            self._second = None
 
 
 @contextlib.contextmanager

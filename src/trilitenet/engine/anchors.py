@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,13 @@ class AnchorFit:
 
 
 def box_sizes(
-    dataset: SampleSource, canvas: tuple[int, int], *, limit: int = 5000, seed: int = 0, swapped: bool = False
+    dataset: SampleSource,
+    canvas: tuple[int, int],
+    *,
+    limit: int = 5000,
+    seed: int = 0,
+    swapped: bool = False,
+    progress: Callable[[int, int], None] | None = None,
 ) -> NDArray[np.float64]:
     """Return (N, 2) width and height of the labelled boxes in pixels of the letterboxed input.
 
@@ -64,16 +71,19 @@ def box_sizes(
         seed: Of that draw.
         swapped: As the published code has it: the width, as a share of the image's, times the height of the resized
             image, and the height times its width.
+        progress: Called with how many images are read, and of how many.
     """
     order = np.random.default_rng(seed).permutation(len(dataset))[:limit]
     sizes = [np.zeros((0, 2))]
-    for index in order:
+    for done, index in enumerate(order, start=1):
         sample = dataset[int(index)]
         if sample.boxes is not None and len(sample.boxes):
             resized = Letterbox.fit(sample.size, canvas=canvas).resized
             width, height = resized if swapped else resized[::-1]
             scale = np.array([width / sample.size[1], height / sample.size[0]])
             sizes.append((sample.boxes[:, 2:] - sample.boxes[:, :2]) * scale)
+        if progress is not None:
+            progress(done, len(order))
     return np.concatenate(sizes)
 
 
