@@ -226,13 +226,3 @@ def test_more_than_half_of_a_box_is_on_the_own_car_by_hand() -> None:
     # On it: 6 of 12 rows; 7 of 13; all; 6 of the 11 from 25 to 36; all that is in the picture; nothing of nothing.
     found = on_own_car(valid, np.array(rows, np.float64))
     assert found.tolist() == [False, True, True, True, True, False]
-
-
-def test_only_so_many_boxes_of_an_image_count() -> None:
-    two = boxes((20, 0, 30, 10, 0.9), (0, 0, 10, 10, 0.8))  # the better one is wrong
-    for most, ap50 in ((1, 0.0), (2, 0.5)):
-        metrics = FairMetrics(("vehicle",), ("detection",), max_boxes=most)
-        metrics.update(sample("a", None, "00", truth((0, 0, 10, 10)), truth()), Perception((1, 2), boxes=two))
-        scores = metrics.compute().detection
-        assert scores is not None
-        assert scores.ap50 == ap50

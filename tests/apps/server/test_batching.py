@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import CancelledError
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -140,14 +141,15 @@ class Clock:
         return self.now
 
 
-def test_the_time_in_the_queue_and_that_in_the_network_are_told() -> None:
+def test_the_time_in_the_queue_and_that_in_the_network_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
+    monkeypatch.setattr("trilitenet.apps.server.batching.time", SimpleNamespace(monotonic=clock))
 
     def run(batch: NDArray[np.uint8]) -> RawOutputs:
         clock.now += 3
         return RawOutputs(None, batch[..., 0].copy(), None)
 
-    batcher = Batcher(run, max_batch=1, clock=clock)
+    batcher = Batcher(run, max_batch=1)
     future = batcher.submit(canvas(0), LATER)
     clock.now += 2
     batcher.start()
