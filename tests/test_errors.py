@@ -50,6 +50,17 @@ def test_writing_tells_the_cause_in_one_line(tmp_path: Path) -> None:
         pass
 
 
+def test_a_file_that_cannot_be_replaced_is_told_by_its_own_name(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").mkdir()
+    with (
+        pytest.raises(OutputError, match=r"[/\\]a\.txt: cannot be written \(Is a directory\)"),
+        writing("x"),
+        replacing(tmp_path / "a.txt") as part,
+    ):
+        part.write_text("new")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+
+
 @pytest.mark.parametrize("name", ["n" * 251 + ".jpg", "\u8def" * 80 + ".openlabel.json", "a.txt"])
 def test_a_temporary_name_is_no_longer_than_the_system_takes(tmp_path: Path, name: str) -> None:
     path = tmp_path / name

@@ -170,7 +170,8 @@ def writing(output: str | Path) -> Iterator[None]:
     except OSError as error:
         if isinstance(error, TriLiteNetError):
             raise
-        raise OutputError(f"{error.filename or output}: cannot be written ({error.strerror or error})") from error
+        path = error.filename2 or error.filename or output  # the former is what a temporary file was to replace
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def part_of(path: Path) -> Path:
