@@ -37,6 +37,8 @@ def greet(monkeypatch: pytest.MonkeyPatch) -> list[object]:
             loudness: How loud.
         """
         calls.append((name, loudness))
+        if name == "too long":
+            Path("x" * 300).stat()
         if name.startswith("nobody"):
             raise OutputError(f"{name}: cannot be greeted")
         if name == "somebody":
@@ -78,6 +80,13 @@ def test_an_error_is_one_line(greet: list[object], capsys: pytest.CaptureFixture
 def test_what_nobody_foresaw_is_not_taken_for_a_full_output(greet: list[object]) -> None:
     with pytest.raises(OSError, match="as nobody foresaw"):
         cli.main(["greet", "somebody"])
+
+
+def test_a_path_that_the_system_refuses_is_no_traceback(
+    greet: list[object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["greet", "too long"]) == 1
+    assert capsys.readouterr().err == f"error: {'x' * 300}: File name too long\n"
 
 
 def test_a_name_in_an_error_breaks_no_line_and_controls_no_terminal(

@@ -213,9 +213,11 @@ def main(words: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader, such as `head`, has gone
         _discard_output()
     except OSError as error:
-        if words and not {"--help", "-h", "--version"} & set(words):
+        if not words or {"--help", "-h", "--version"} & set(words):
+            return _fail(_output_failed(error), code=1)
+        if error.filename is None:
             raise
-        return _fail(_output_failed(error), code=1)
+        return _fail(f"{error.filename}: {error.strerror}", code=1)  # such as a name that is too long
     return int(getattr(result, "exit_code", 0))
 
 
