@@ -364,3 +364,11 @@ def test_a_full_disk_is_told(root: Path, tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(Path, "write_text", full)
     with pytest.raises(OutputError, match="out: cannot be written"):
         prepare(root, tmp_path / "out", canvas=CANVAS, splits=["val"])
+
+
+def test_classes_that_no_box_is_of_are_told(root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    prepare(root, tmp_path / "own", canvas=CANVAS, splits=["val"])
+    assert not caplog.text
+    prepare(root, tmp_path / "out", canvas=CANVAS, splits=["val"], class_names=("zebra",))
+    assert "no box of" in caplog.text
+    assert "the classes are zebra, the data hold" in caplog.text

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import logging
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 from trilitenet.commands.load import load
 from trilitenet.commands.paths import check_writable, text_paths
@@ -27,8 +26,6 @@ from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.corruptions import SEVERITIES
 
 __all__ = ["evaluate", "hash_dataset", "hash_model", "write_report"]
-
-_LOGGER: Final = logging.getLogger(__name__)
 
 
 @text_paths
@@ -113,7 +110,7 @@ def evaluate(
         resized = _resized(predictor, resolution)
         dataset = DrivingDataset(data, split, class_names=predictor.card.class_names)
         if "detection" in predictor.card.tasks:
-            warn_of_foreign(dataset)
+            dataset.warn_of_foreign()
         writer = None
         if save is not None:
             writer = stack.enter_context(PredictionWriter(save, predictor.card.tasks, overwrite=overwrite))
@@ -177,18 +174,6 @@ def _check_artefact(model: str, predictor: Predictor, protocol: str) -> None:
         raise ConfigError(
             f"{model} decides masks inside, by thresholds of its own; the 'paper' protocol takes the likelier class: "
             "export it with --masks probability"
-        )
-
-
-def warn_of_foreign(dataset: DrivingDataset) -> None:
-    """Warn if no box of the data set is of a class that the model knows."""
-    if categories := dataset.foreign_categories():
-        _LOGGER.warning(
-            "no box of %s is of a class of the model, so detection cannot score: the model knows %s, the data hold %s; "
-            "say under classes: in dataset.yaml which categories make up a class",
-            dataset.root,
-            ", ".join(dataset.class_names),
-            ", ".join(categories[:10]) + (" and others" if len(categories) > 10 else ""),
         )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from trilitenet.commands.evaluate import check_counts, check_output, hash_dataset, warn_of_foreign, write_report
+from trilitenet.commands.evaluate import check_counts, check_output, hash_dataset, write_report
 from trilitenet.commands.paths import text_paths
 from trilitenet.commands.progress import show_progress
 from trilitenet.data.reading import DrivingDataset
@@ -69,7 +69,7 @@ def score(
     dataset = DrivingDataset(data, split, class_names=tuple(classes))
     saved = SavedPredictions(predictions, classes)
     if "detection" in saved.tasks:
-        warn_of_foreign(dataset)
+        dataset.warn_of_foreign()
     with show_progress("images") as shown:
         report = score_predictions(
             saved,

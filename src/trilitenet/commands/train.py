@@ -29,7 +29,6 @@ from rich.progress import (
 )
 from rich.table import Column
 
-from trilitenet.commands.evaluate import warn_of_foreign
 from trilitenet.commands.paths import text_paths
 from trilitenet.commands.progress import show_bars
 from trilitenet.config import DEFAULT_ANCHORS, ModelCard, parse_yaml
@@ -222,7 +221,7 @@ def _check_labels(config: TrainConfig, dataset: SampleSource) -> None:
     if "detection" in config.tasks:
         for part in parts:
             if isinstance(part, DrivingDataset):
-                warn_of_foreign(part)
+                part.warn_of_foreign()
 
 
 def _transform(config: TrainConfig, dataset: SampleSource, display: _Display) -> Transform:

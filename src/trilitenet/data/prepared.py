@@ -159,6 +159,8 @@ def prepare(
             f"{root}: no splits with images below {IMAGE_FOLDER}; expected the published layout, see docs/data.md"
         )
     datasets = {split: DrivingDataset(root, split, class_names=names) for split in chosen}
+    for dataset in datasets.values():
+        dataset.warn_of_foreign()
     with writing(out):
         _open_out(plan)
     jobs = [

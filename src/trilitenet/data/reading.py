@@ -301,6 +301,17 @@ class DrivingDataset:
                 return ()
         return tuple(sorted(found))
 
+    def warn_of_foreign(self) -> None:
+        """Warn if no box is of a class."""
+        if categories := self.foreign_categories():
+            _LOGGER.warning(
+                "no box of %s is of a class: the classes are %s, the data hold %s; say under classes: in dataset.yaml "
+                "which categories make up a class",
+                self.root,
+                ", ".join(self.class_names),
+                ", ".join(categories[:10]) + (" and others" if len(categories) > 10 else ""),
+            )
+
     def __getitem__(self, index: int) -> Sample:
         """Read a sample.
 

@@ -43,8 +43,8 @@ class TrainConfig:
         swapped_anchors: Fit them with width and height swapped, always, as the published code does.
         init: Weight file to start from (or a shipped name); what fits by name and shape is taken over.
         freeze: Parts that stay as they are, for example encoder, or encoder.level1.
-        teacher: Weight file of a network to distil from, of any variant, with the same classes; or a folder of any
-            model's saved outputs on the training images, as `trilitenet evaluate --save` writes them.
+        teacher: Weight file of a network to distil from, of any variant, with the same classes where it teaches boxes;
+            or a folder of any model's saved outputs on the training images, as `trilitenet evaluate --save` writes.
         distillation: Weights of distillation's detection, drivable and lane terms.
         teacher_confidence: Of a folder's boxes, those scored at least the second number are objects, those between the
             two are ignored regions.

@@ -90,7 +90,8 @@ def read_camera(path: str | Path) -> Camera:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read as a camera file ({error})") from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ConfigError(f"{path}: cannot be read as a camera file ({reason})") from error
     # OpenCV's FileStorage writes a directive and a tag that are no standard YAML.
     text = re.sub(r"\A%YAML.*\n", "", text).replace("!!opencv-matrix", "")
     content = parse_yaml(text, str(path))
