@@ -317,7 +317,7 @@ def _load_strictly(network: TriLiteNet, tensors: Mapping[str, Tensor], source: s
     for key, tensor in tensors.items():
         if tensor.shape != own[key].shape:
             raise WeightsError(f"{source}: {key} is {tuple(tensor.shape)}, must be {tuple(own[key].shape)}")
-        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
+        if not torch.isfinite(tensor.to(own[key].dtype)).all():  # as it is loaded: of 8-bit floats it cannot be told
             raise WeightsError(f"{source}: {key} holds values that are not finite; the file is damaged")
     network.load_state_dict({key: tensors.get(key, own[key]).to(own[key].dtype) for key in own})
 
