@@ -221,8 +221,12 @@ def test_an_interruption_leaves_no_half_of_an_artefact(tmp_path: Path, monkeypat
             for name in names:
                 trial.with_name(name).write_text("new")
 
-    with pytest.raises(KeyboardInterrupt):
-        put()
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            put()
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == dict.fromkeys(names, "new")
 
 
