@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import errno
 import importlib
@@ -256,6 +257,46 @@ def test_a_disk_that_is_full_from_the_beginning_leaves_no_file(
             writer.write(video[0])
         assert writer.files == []
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["csv", "jsonl"])
+@pytest.mark.parametrize("full", [False, True])
+def test_no_file_is_renamed_or_removed_while_it_is_open(
+    name: str, full: bool, tmp_path: Path, video: list[Perception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[io.FileIO] = []
+    moved: list[bool] = []  # Windows refuses what is still open
+
+    class Watched(io.FileIO):
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            opened.append(self)
+
+        def write(self, data: Any) -> int:
+            if full:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return super().write(data)
+
+    def watch(method: str) -> None:
+        original = getattr(Path, method)
+
+        def watched(self: Path, *arguments: Any, **more: Any) -> Any:
+            moved.append(any(not file.closed for file in opened if file.name == self))
+            return original(self, *arguments, **more)
+
+        monkeypatch.setattr(Path, method, watched)
+
+    monkeypatch.setattr("trilitenet.formats.writers.base.io.FileIO", Watched)
+    watch("replace")
+    watch("unlink")
+    with open_writer(name, tmp_path) as writer:
+        for perception in video[:1] if full else video[:2]:
+            with contextlib.suppress(OSError):
+                writer.write(perception)
+    assert moved
+    assert not any(moved)
+    if name == "jsonl" and not full:
+        assert len((tmp_path / "perceptions.jsonl").read_text().splitlines()) == 2
 
 
 def test_a_picture_whose_file_is_there_does_not_keep_others_from_theirs(

@@ -284,8 +284,10 @@ class GrowingFile:
 
     def keep(self) -> None:
         """Let the last addition stay."""
-        if self.path not in self._files:
+        if self._handle is not None and self.path not in self._files:
+            self._handle.close()  # Windows renames and removes no file that is open
             part_of(self.path).replace(self.path)
+            self._handle = io.FileIO(self.path, "a")
             self._files.append(self.path)
 
     def take_back(self) -> None:
@@ -294,9 +296,9 @@ class GrowingFile:
             return
         if self._before:
             self._handle.truncate(self._before)
-        else:
-            part_of(self.path).unlink(missing_ok=True)
         self._handle.close()
+        if not self._before:
+            part_of(self.path).unlink(missing_ok=True)
 
     def close(self) -> None:
         """End the file. Without any addition one that is there stays as it is, else it is made of the head alone."""
