@@ -286,7 +286,7 @@ def _one_line(error: CycloptsError) -> str:
     """Return the message as one line, and how to get help."""
     if isinstance(error, UnknownOptionError):
         option = (error.token.keyword or error.token.value).partition("=")[0]
-        known = [name for argument in error.argument_collection if argument.parse for name in argument.names]
+        known = [name for argument in error.argument_collection for name in argument.names]
         near = did_you_mean(option, known)
         text = f"unknown option {option}" + (near if near.endswith("?") else "")
     elif isinstance(error, UnusedCliTokensError):
