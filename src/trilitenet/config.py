@@ -511,9 +511,11 @@ def _flags_for_numbers(value: Any, given: Any, path: str = "") -> Iterable[tuple
 
 
 def _explain(cls: type[Any], error: ValidationError) -> str:
-    first = error.errors()[0]
+    errors = error.errors()
+    unknown = next((one for one in errors if one["type"] in {"unexpected_keyword_argument", "extra_forbidden"}), None)
+    first = unknown or errors[0]  # a key that is missing may be the one that is misspelt
     path = ".".join(str(part) for part in first["loc"])
-    if first["type"] in {"unexpected_keyword_argument", "extra_forbidden"}:
+    if unknown:
         owner: Any = cls
         for part in first["loc"][:-1]:
             kind = get_type_hints(owner).get(str(part))

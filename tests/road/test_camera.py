@@ -92,6 +92,10 @@ def test_a_field_of_view_is_enough(tmp_path: Path) -> None:
         ("image_width: 640\nimage_height: 360\nheight: 0\nfield_of_view: 60\n", "height must be positive"),
         ("image_width: 640\nimage_height: 360\nheight: 1\ncamera_matrix: {data: [1, 2]}\n", "9 numbers, got 2"),
         (SHORT + "camera_matrix: [[1, 2], [3]]\n", "9 numbers, got 3"),
+        (
+            "image_width: 640\nimage_height: 360\nheigth: 1.5\nfield_of_view: 60\n",
+            "unknown key 'heigth'; did you mean 'height'",
+        ),
         (SHORT + "camera_matrix: {data: [1], colls: 3}\n", "unknown key 'camera_matrix.colls'; did you mean 'cols'"),
         (SHORT + "camera_matrix: [900, 0, .nan, 0, 900, 180, 0, 0, 1]\n", "must be finite numbers"),
         (SHORT + "camera_matrix: [900, 2, 320, 0, 900, 180, 0, 0, 1]\n", "cannot be skewed"),
