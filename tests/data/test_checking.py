@@ -273,6 +273,21 @@ def test_described_values_are_expected(root: Path) -> None:
     assert check_dataset(root).ok
 
 
+@pytest.mark.parametrize(
+    ("target", "reason"),
+    [
+        ("moved.jpg", "links to moved.jpg, which is not there"),
+        ("train_0004.jpg", "Too many levels of symbolic links"),
+    ],
+)
+def test_what_is_wrong_with_a_link_is_told(root: Path, target: str, reason: str) -> None:
+    image = root / "images/train/train_0004.jpg"
+    image.unlink()
+    image.symlink_to(target)
+    (finding,) = [finding for finding in check_dataset(root).findings if finding.kind == "image-unreadable"]
+    assert finding.examples == (f"images/train/train_0004.jpg ({reason})",)
+
+
 def test_many_pictures_of_one_hash_are_compared_at_once() -> None:
     rng = np.random.default_rng(0)
 

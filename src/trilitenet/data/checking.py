@@ -386,8 +386,9 @@ def _look_at_image(
     try:
         data = path.read_bytes()
     except OSError as error:
-        link = f"links to {path.readlink()}, which is not there" if path.is_symlink() else error.strerror
-        faults.append(("image-unreadable", f"{where} ({link})"))
+        gone = isinstance(error, FileNotFoundError) and path.is_symlink()
+        reason = f"links to {path.readlink()}, which is not there" if gone else error.strerror
+        faults.append(("image-unreadable", f"{where} ({reason})"))
         return None, b"", 0, b""
     digest = hashlib.blake2b(data, digest_size=12).digest()
     try:
