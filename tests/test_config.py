@@ -3,7 +3,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import sys
 
 import pytest
 
@@ -58,7 +57,6 @@ def test_a_message_shows_the_beginning_of_a_long_value(value: object) -> None:
     assert len(str(caught.value)) < 400
 
 
-DEEP = sys.getrecursionlimit()
 ALIASES = "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 9))
 
 
@@ -81,9 +79,9 @@ def test_yaml_of_what_cannot_be_is_told_in_one_line(text: str, message: str) -> 
 
 def test_json_that_is_nested_too_deeply_is_no_json() -> None:
     with pytest.raises(ValueError, match=r"^nested too deeply$"):
-        parse_json("[" * 20 * DEEP)
+        parse_json("[" * 500_000)
     with pytest.raises(WeightsError, match=r"^here: its card is not JSON \(nested too deeply\)$"):
-        ModelCard.from_json("[" * 20 * DEEP, "here")
+        ModelCard.from_json("[" * 500_000, "here")
 
 
 @pytest.mark.parametrize(
