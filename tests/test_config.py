@@ -102,6 +102,9 @@ def test_yaml_with_a_key_twice_is_refused_with_its_line() -> None:
         parse_yaml("x: {a: 1, a: 1}", "here")
     anchors = "one: &one {a: 1, b: 2}\ntwo: {<<: *one, b: 3}\nthree: {<<: *one, <<: {c: 1}}"
     assert parse_yaml(anchors, "here")["two"] == {"a": 1, "b": 3}
+    merged_first = "one: {<<: &two {<<: {a: 1}, a: 2}}\ntwo: *two"
+    assert parse_yaml(merged_first, "here")["two"] == {"a": 2}
+    assert parse_yaml("{1: a, '1': b}", "here") == {1: "a", "1": "b"}
 
 
 def test_broken_yaml_is_told_with_its_line() -> None:

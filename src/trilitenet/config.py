@@ -10,7 +10,7 @@ import dataclasses
 import itertools
 import json
 import math
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar, get_args, get_type_hints
 
@@ -394,15 +394,15 @@ class _YamlLoader(yaml.SafeLoader):
                 raise ValueError(f"its aliases stand for more than {_MOST_ALIASED} values")
         return node
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        keys: set[str] = set()
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        node: yaml.MappingNode = super().compose_mapping_node(anchor)  # as written, before merges put keys of others in
+        keys: set[tuple[str, str]] = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
-                if key.value in keys:
-                    problem = f"key {key.value!r} twice"
-                    raise yaml.constructor.ConstructorError(problem=problem, problem_mark=key.start_mark)
-                keys.add(key.value)
-        return super().construct_mapping(node, deep)
+                if (key.tag, key.value) in keys:
+                    raise yaml.composer.ComposerError(problem=f"key {key.value!r} twice", problem_mark=key.start_mark)
+                keys.add((key.tag, key.value))
+        return node
 
 
 def parse_json(text: str | bytes) -> Any:
