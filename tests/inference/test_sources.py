@@ -513,6 +513,15 @@ def test_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(frames[0].image[0, 0], [0, 0, 255])
     with pytest.raises(InputError, match="camera-7: there is no such camera"):
         list(CameraReader(7))
+    levels = [3]
+
+    def set_level(level: int) -> int:
+        levels.append(level)
+        return levels[-2]
+
+    monkeypatch.setattr("cv2.setLogLevel", set_level, raising=False)  # as in OpenCV 4
+    assert len(list(CameraReader(0))) == 3
+    assert levels == [3, 0, 3]
 
 
 def test_stills_go_on_past_a_broken_one(tmp_path: Path) -> None:

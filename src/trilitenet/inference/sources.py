@@ -574,11 +574,13 @@ def _is_file(path: Path) -> bool:
 @contextlib.contextmanager
 def _silent_opencv() -> Iterator[None]:
     """Keep OpenCV from printing: what it has to say is raised."""
-    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    # OpenCV 4 has it by the first name, OpenCV 5 by the second.
+    set_level: Callable[[int], int] = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel
+    before = set_level(0)
     try:
         yield
     finally:
-        cv2.utils.logging.setLogLevel(before)
+        set_level(before)
 
 
 def _av() -> Any:
