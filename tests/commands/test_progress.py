@@ -52,7 +52,10 @@ def test_a_training_shows_its_step_in_a_narrow_terminal(monkeypatch: pytest.Monk
     assert len(last) <= 80
 
 
-def test_a_training_tells_its_steps_in_lines_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_training_tells_its_steps_in_lines_where_there_is_no_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
     with _display(quiet=False) as display:
         display.step(12, 500, LOSSES)
     with _display(quiet=True) as display:

@@ -288,7 +288,7 @@ def test_what_is_wrong_with_a_link_is_told(root: Path, target: str, reason: str)
     assert finding.examples == (f"images/train/train_0004.jpg ({reason})",)
 
 
-def test_many_pictures_of_one_hash_are_compared_at_once() -> None:
+def test_copies_are_found_among_many_pictures_of_one_hash() -> None:
     rng = np.random.default_rng(0)
 
     def fact(number: int) -> checking._Facts:

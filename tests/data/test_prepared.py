@@ -367,8 +367,11 @@ def test_a_full_disk_is_told(root: Path, tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_classes_that_no_box_is_of_are_told(root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(DataError, match="no box is of the class out, zebra; a folder to write goes before --classes"):
+        prepare(root, canvas=CANVAS, splits=["val"], class_names=("car", "zebra", "out"))
+    assert not (root / ".prepared").exists()
     prepare(root, tmp_path / "own", canvas=CANVAS, splits=["val"])
     assert not caplog.text
-    prepare(root, tmp_path / "out", canvas=CANVAS, splits=["val"], class_names=("zebra",))
-    assert "no box of" in caplog.text
+    describe(root, "classes: {zebra: [striped]}\n")
+    prepare(root, tmp_path / "out", canvas=CANVAS, splits=["val"])
     assert "the classes are zebra, the data hold" in caplog.text

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import sys
 import tempfile
 from pathlib import Path
@@ -116,5 +117,7 @@ def test_no_room_for_temporary_files_is_told(monkeypatch: pytest.MonkeyPatch) ->
 
     # PyTorch aborts the process where it cannot write: it never gets the file.
     monkeypatch.setattr(Path, "write_bytes", fill)
-    with pytest.raises(OutputError, match=rf"^{tempfile.gettempdir()}: cannot be written \(No space left on device\)$"):
+    with pytest.raises(
+        OutputError, match=rf"^{re.escape(tempfile.gettempdir())}: cannot be written \(No space left on device\)$"
+    ):
         build(lively_network("tiny"))

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import tempfile
 from pathlib import Path
 
@@ -20,7 +21,9 @@ def test_no_room_for_temporary_files_is_told(monkeypatch: pytest.MonkeyPatch) ->
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(Path, "write_bytes", fill)
-    with pytest.raises(OutputError, match=rf"^{tempfile.gettempdir()}: cannot be written \(No space left on device\)$"):
+    with pytest.raises(
+        OutputError, match=rf"^{re.escape(tempfile.gettempdir())}: cannot be written \(No space left on device\)$"
+    ):
         quantize_onnx(onnx.ModelProto(), [np.zeros((1, 32, 32, 3), np.uint8)])
 
 

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from trilitenet.commands.evaluate import check_counts
 from trilitenet.commands.load import load
 from trilitenet.commands.paths import text_paths
 from trilitenet.commands.progress import show_progress
@@ -106,8 +107,7 @@ def finish(
         raise OutputError(f"{destination}: exists already; give another name or --overwrite")
     if input_size is not None:
         check_size(input_size, "--input-size")
-    if batch_size < 1:
-        raise ConfigError(f"--batch-size must be at least 1, got {batch_size}")
+    check_counts(0, batch_size=batch_size)
     network = load_network(source)
     described = _describe(network.card, [_read_card_text(path) for path in card])
     if input_size is not None:

@@ -142,7 +142,7 @@ def prepare(
     Raises:
         ConfigError: If a number is out of range.
         OutputError: If ``out`` holds something else, or was made with other settings.
-        DataError: If the data set is broken.
+        DataError: If the data set is broken, or no box is of one of the ``class_names`` that are given.
     """
     root = Path(root)
     out = Path(out) if out is not None else root / CACHE_FOLDER
@@ -159,8 +159,14 @@ def prepare(
             f"{root}: no splits with images below {IMAGE_FOLDER}; expected the published layout, see docs/data.md"
         )
     datasets = {split: DrivingDataset(root, split, class_names=names) for split in chosen}
-    for dataset in datasets.values():
-        dataset.warn_of_foreign()
+    if class_names:
+        if without := set.intersection(*(dataset.classes_without_boxes() for dataset in datasets.values())):
+            raise DataError(
+                f"{root}: no box is of the class {', '.join(sorted(without))}; a folder to write goes before --classes"
+            )
+    else:
+        for dataset in datasets.values():
+            dataset.warn_of_foreign()
     with writing(out):
         _open_out(plan)
     jobs = [

@@ -288,18 +288,34 @@ class DrivingDataset:
     def foreign_categories(self) -> tuple[str, ...]:
         """Return the categories of the boxes if none of them is in a class, else nothing; reads up to the first."""
         found: set[str] = set()
+        for categories in self._categories():
+            found |= categories
+            if found & self._table.keys():
+                return ()
+        return tuple(sorted(found))
+
+    def classes_without_boxes(self) -> set[str]:
+        """Return the classes that no box is of, none where there are no boxes; reads up to the first of each."""
+        without, boxes = dict(enumerate(self._class_names)), False
+        for categories in self._categories():
+            boxes = boxes or bool(categories)
+            for category in categories & self._table.keys():
+                without.pop(self._table[category], None)
+            if not without:
+                break
+        return set(without.values()) if boxes else set()
+
+    def _categories(self) -> Iterator[set[str]]:
+        """Yield the categories of each image's boxes."""
         for name in self.names if "detection" in self._tasks else ():
             content = self._annotation(name)
             if content is None:
                 continue
             try:
                 items = [item for frame in content["frames"] for item in frame.get("objects") or ()]
-                found |= {str(item["category"]) for item in items if item.get("box2d") is not None}
+                yield {str(item["category"]) for item in items if item.get("box2d") is not None}
             except (KeyError, TypeError, AttributeError):
                 continue  # told when the sample is read
-            if found & self._table.keys():
-                return ()
-        return tuple(sorted(found))
 
     def warn_of_foreign(self) -> None:
         """Warn if no box is of a class."""

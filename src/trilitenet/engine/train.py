@@ -252,8 +252,9 @@ class Trainer:
             self.load(resume)
         if self.fabric.is_global_zero:
             with writing(self.folder):
-                for part in self.folder.glob(".*.part"):  # of a run that was killed while it wrote
-                    part.unlink()
+                for name in (*_RESULTS, *_TRACES):
+                    for part in self.folder.glob(f".{name}.*.part"):  # of a run that was killed while it wrote
+                        part.unlink()
                 if resume is None:
                     _forget(self.folder)
                 write_file(self.folder / "config.yaml", yaml.safe_dump(self.config.to_dict(), sort_keys=False))
