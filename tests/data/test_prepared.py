@@ -275,6 +275,7 @@ def test_damaged_shards_are_named_and_made_anew(root: Path, tmp_path: Path) -> N
         (shard, whole[shard][: len(whole[shard]) // 2], r"train-000001\.tar: is cut short; prepare the data set again"),
         (index, whole[index][:-9], r"train-000001\.index\.jsonl: is damaged; prepare the data set again"),
         (index, b"[]\n" + whole[index], r"train-000001\.index\.jsonl: is damaged; prepare the data set again"),
+        (index, b"", r"train-000001\.index\.jsonl: is empty; prepare the data set again"),
     ):
         path.write_bytes(content)
         with pytest.raises(DataError, match=message):

@@ -393,7 +393,7 @@ def prepare(
         output: Folder to write; ``.prepared`` in the data set if left out, where training finds it by itself.
         size: Height and width that training will use.
         splits: Prepare these splits alone.
-        classes: Detection classes; those of the data set if left out.
+        classes: Detection classes, each of some box; those of the data set if left out. They come after OUTPUT.
         images: ``raw`` gives training exactly the same pixels, and is quickest; ``jpeg`` takes a sixth of the room.
         quality: Of the JPEGs, of 100.
         mask_above: A resized mask pixel above this, of 255, is foreground; the published rule is 1.

@@ -289,6 +289,8 @@ class PreparedDataset:
         self._shards: list[str] = state["shards"][split]
         for number, shard in enumerate(self._shards):
             lines = self._place.file(_index_name(shard)).read_bytes().splitlines()
+            if not lines:
+                raise DataError(f"{_index_name(shard)}: is empty; prepare the data set again")
             self._lines += lines
             self._shard_of += [number] * len(lines)
 
