@@ -33,7 +33,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import Task, check_size
+from trilitenet.config import Task, check_size, parse_json
 from trilitenet.data.description import DESCRIPTION_FILE, read_description
 from trilitenet.data.reading import (
     IMAGE_ENDINGS,
@@ -413,7 +413,7 @@ def _parse_entry(line: bytes, name: str) -> dict[str, Any]:
         DataError: If it is none.
     """
     try:
-        entry: dict[str, Any] = json.loads(line)
+        entry: dict[str, Any] = parse_json(line)
         if entry.keys() >= _ENTRY:
             return entry
     except (ValueError, AttributeError):
@@ -625,7 +625,7 @@ def _read_state(folder: Path) -> dict[str, Any]:
     path = folder / PREPARED_FILE
     cure = f"remove {folder} and prepare the data set again"
     try:
-        state: Any = json.loads(path.read_bytes())
+        state = parse_json(path.read_bytes())
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be read ({error}); {cure}") from error
     found = state.get("format") if isinstance(state, dict) else None
