@@ -23,6 +23,7 @@ import importlib
 import os
 import secrets
 import stat
+import tempfile
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -47,6 +48,7 @@ __all__ = [
     "import_extra",
     "part_of",
     "replacing",
+    "scratch_folder",
     "shown",
     "write_file",
     "writing",
@@ -172,6 +174,17 @@ def writing(output: str | Path) -> Iterator[None]:
             raise
         path = error.filename2 or error.filename or output  # the former is what a temporary file was to replace
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+@contextlib.contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Yield a folder for temporary files, which goes with the block.
+
+    Raises:
+        OutputError: If there is no room in it; the error names the folder of all temporary files.
+    """
+    with writing(tempfile.gettempdir()), tempfile.TemporaryDirectory(prefix="trilitenet-") as folder:
+        yield Path(folder)
 
 
 def part_of(path: Path) -> Path:

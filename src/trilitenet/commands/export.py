@@ -31,7 +31,7 @@ from trilitenet.deploy.quantize import KEEP_STEPS, quantize_onnx, quantize_openv
 from trilitenet.deploy.tensorrt import build_engine, is_installed, trtexec_line
 from trilitenet.deploy.triton import write_triton_repository
 from trilitenet.engine.evaluate import evaluate
-from trilitenet.errors import BackendError, ConfigError, InputError, OutputError, did_you_mean, writing
+from trilitenet.errors import BackendError, ConfigError, InputError, OutputError, did_you_mean, scratch_folder, writing
 from trilitenet.formats.writers.base import uninterrupted
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.exported import prepare_input
@@ -166,11 +166,11 @@ def export(
     if nms and "detection" not in network.tasks:
         raise ConfigError(f"{model} has no detection task, so there are no boxes to suppress; leave --nms out")
     if format == "triton":
-        with writing(tempfile.gettempdir()), tempfile.TemporaryDirectory() as folder:
+        with scratch_folder() as folder:
             exported = export(
                 model,
                 format="onnx",
-                output=Path(folder) / "model.onnx",
+                output=folder / "model.onnx",
                 precision=precision,
                 size=size,
                 calibration=calibration,
@@ -538,8 +538,8 @@ def _export_int8(
         candidate = quantize(built, inputs, keep)
         drop = 0.0
         if budget:
-            with writing(tempfile.gettempdir()), tempfile.TemporaryDirectory() as folder:
-                trial = Path(folder) / path.name
+            with scratch_folder() as folder:
+                trial = folder / path.name
                 _write(candidate, trial, network, info)
                 drop = budget.measure(_open(trial, info))
         if max_drop is None or drop <= max_drop:

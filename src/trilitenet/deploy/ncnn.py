@@ -10,7 +10,6 @@ import hashlib
 import io
 import json
 import subprocess
-import tempfile
 import warnings
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -19,7 +18,7 @@ import torch
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, GRAPH_HASH_KEY, WEIGHTS_HASH_KEY, ArtefactInfo, ModelCard
 from trilitenet.deploy.graph import DeployGraph, Traceable
-from trilitenet.errors import BackendError, import_extra, writing
+from trilitenet.errors import BackendError, import_extra, scratch_folder
 
 __all__ = ["NcnnModel", "build_ncnn", "save_ncnn"]
 
@@ -54,8 +53,7 @@ def build_ncnn(graph: DeployGraph, card: ModelCard, info: ArtefactInfo) -> NcnnM
     assert info.size is not None
     pnnx = import_extra("pnnx", "ncnn")
     traceable = Traceable(graph, card, info)
-    with writing(tempfile.gettempdir()), tempfile.TemporaryDirectory(prefix="trilitenet-ncnn-") as name:
-        folder = Path(name)
+    with scratch_folder() as folder:
         traced = io.BytesIO()  # PyTorch aborts the process where it cannot write to a file
         with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")  # a trace is what pnnx reads; PyTorch would rather it read something newer

@@ -15,7 +15,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import tempfile
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -23,7 +22,7 @@ from typing import Any, Final
 
 from numpy.typing import NDArray
 
-from trilitenet.errors import ConfigError, import_extra, writing
+from trilitenet.errors import ConfigError, import_extra, scratch_folder
 
 __all__ = ["KEEP_STEPS", "kept_nodes", "quantize_onnx", "quantize_openvino"]
 
@@ -120,8 +119,8 @@ def quantize_onnx(model: Any, images: Sequence[NDArray[Any]], keep: Sequence[str
         def get_next(self) -> Mapping[str, NDArray[Any]] | None:
             return next(self.rest, None)
 
-    with writing(tempfile.gettempdir()), tempfile.TemporaryDirectory() as folder, _quiet():
-        source, prepared, target = (Path(folder) / name for name in ("a.onnx", "b.onnx", "c.onnx"))
+    with scratch_folder() as folder, _quiet():
+        source, prepared, target = (folder / name for name in ("a.onnx", "b.onnx", "c.onnx"))
         source.write_bytes(model.SerializeToString())
         shape_inference.quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
         quantization.quantize_static(
