@@ -340,47 +340,40 @@ def test_a_terminal_shows_how_far_the_images_are(monkeypatch: pytest.MonkeyPatch
     assert shown == [False, True]  # gone at the end
 
 
-def test_a_kill_between_the_best_and_the_checkpoint_is_no_step_back(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("values", "killed", "options", "best"),
+    [
+        # A kill between the best and the checkpoint is no step back ...
+        ([0.1, 0.2, 0.2, 0.3], 4, {"max_steps": 6}, (6, 0.3)),
+        # ... and best weights newer than the checkpoint stop no run early: the third and fourth epoch are run again.
+        ([0.1, 0.2, 0.3, 0.4, 0.3, 0.4], 8, {"max_steps": 8, "checkpoint_every": 2}, (8, 0.4)),
+    ],
+)
+def test_a_kill_before_the_checkpoint_changes_no_end(
+    scenes: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    values: list[float],
+    killed: int,
+    options: dict[str, int],
+    best: tuple[int, float],
 ) -> None:
-    values = iter([0.1, 0.2, 0.2, 0.3])
-    monkeypatch.setattr("trilitenet.commands.train.validation_figures", lambda *_: {"drivable/miou": next(values)})
+    figures = iter(values)
+    monkeypatch.setattr("trilitenet.commands.train.validation_figures", lambda *_: {"drivable/miou": next(figures)})
     save = Trainer.save
 
-    def killed(self: Trainer) -> None:
-        if self.step == 4:
+    def die(self: Trainer) -> None:
+        if self.step == killed:
             raise KeyboardInterrupt
         save(self)
 
-    options = settings(scenes, tmp_path, val_split="val", tasks=("drivable",), pictures=0, patience=1, max_steps=6)
-    monkeypatch.setattr(Trainer, "save", killed)
-    with pytest.raises(KeyboardInterrupt):
-        train(**options)
-    monkeypatch.setattr(Trainer, "save", save)
-    result = train(resume=True, **options)
-    assert (result.steps, result.best["drivable"]) == (6, 0.3)
-
-
-def test_best_weights_newer_than_the_checkpoint_stop_no_resumed_run_early(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    values = iter([0.1, 0.2, 0.3, 0.4, 0.3, 0.4])  # the third and fourth epoch are run again
-    monkeypatch.setattr("trilitenet.commands.train.validation_figures", lambda *_: {"drivable/miou": next(values)})
-    save = Trainer.save
-
-    def killed(self: Trainer) -> None:
-        if self.step == 8:
-            raise KeyboardInterrupt
-        save(self)
-
-    options = {"val_split": "val", "tasks": ("drivable",), "pictures": 0, "patience": 1, "checkpoint_every": 2}
-    run = settings(scenes, tmp_path, **options, max_steps=8)
-    monkeypatch.setattr(Trainer, "save", killed)
+    run = settings(scenes, tmp_path, val_split="val", tasks=("drivable",), pictures=0, patience=1, **options)
+    monkeypatch.setattr(Trainer, "save", die)
     with pytest.raises(KeyboardInterrupt):
         train(**run)
     monkeypatch.setattr(Trainer, "save", save)
     result = train(resume=True, **run)
-    assert (result.steps, result.best["drivable"]) == (8, 0.4)
+    assert (result.steps, result.best["drivable"]) == best
 
 
 def test_an_average_that_comes_later_begins_at_the_weights(scenes: Path, tmp_path: Path) -> None:
