@@ -46,7 +46,7 @@ def test_weights_of_fp16_are_stored_as_such(tmp_path: Path, precision: Any, byte
     ],
 )
 def test_what_the_processor_multiplies_with(flags: str | None, unit: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def read_text(path: Path, encoding: str) -> str:
+    def read_text(path: Path, **_: str) -> str:
         if flags is None:
             raise FileNotFoundError(path)
         return f"model name : x\nflags : fpu {flags}\nbugs :\n"

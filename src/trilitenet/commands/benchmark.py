@@ -26,7 +26,7 @@ from trilitenet.config import VARIANTS, check_size
 from trilitenet.engine.provenance import peak_memory
 from trilitenet.errors import ConfigError, import_extra, write_file
 from trilitenet.inference.predictor import Predictor
-from trilitenet.processing.cores import usable_cores
+from trilitenet.processing.cores import processor, usable_cores
 
 __all__ = ["Benchmark", "Cost", "Timing", "benchmark"]
 
@@ -320,20 +320,11 @@ class _Meter:
 
 
 def _machine(threads: int | None, streams: int) -> dict[str, str]:
-    processor = platform.processor() or platform.machine()
-    flags = ""
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                processor = line.partition(":")[2].strip()
-            if line.startswith("flags"):
-                known = ("avx2", "avx512f", "avx512_bf16", "avx512_vnni", "amx_bf16", "amx_int8")
-                flags = " ".join(flag for flag in known if flag in line.split())
-                break
-    except OSError:
-        pass
+    name, instructions = processor()
+    known = ("avx2", "avx512f", "avx512_bf16", "avx512_vnni", "amx_bf16", "amx_int8")
+    flags = " ".join(flag for flag in known if flag in instructions)
     return {
-        "processor": f"{processor} ({flags})" if flags else processor,
+        "processor": f"{name} ({flags})" if flags else name,
         "cores": str(usable_cores()),
         "threads": "the runtime's choice" if threads is None else str(threads),
         "streams": str(streams),

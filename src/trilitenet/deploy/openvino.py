@@ -9,6 +9,7 @@ from typing import Any
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
 from trilitenet.deploy.layouts import Unit
 from trilitenet.errors import OutputError, import_extra
+from trilitenet.processing.cores import processor
 
 __all__ = ["build_openvino", "save_openvino", "vector_unit", "with_own_biases"]
 
@@ -68,10 +69,7 @@ def save_openvino(model: Any, path: str | os.PathLike[str], card: ModelCard, inf
 
 def vector_unit() -> Unit:
     """Return what the processor multiplies with, as far as the system tells."""
-    try:
-        flags = set(Path("/proc/cpuinfo").read_text(encoding="utf-8").split())
-    except OSError:
-        return "other"
+    _, flags = processor()
     if "amx_bf16" in flags:
         return "amx"
     return "avx512" if "avx512f" in flags else "other"

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 import trilitenet
-from trilitenet.processing.cores import usable_cores
+from trilitenet.processing.cores import processor, usable_cores
 
 __all__ = ["describe_hardware", "describe_versions", "hash_files", "peak_memory"]
 
@@ -49,14 +49,7 @@ def describe_versions() -> Mapping[str, str]:
 
 def describe_hardware() -> str:
     """Return processor, cores that may be used, and system in a line."""
-    model = platform.processor() or platform.machine()
-    listing = Path("/proc/cpuinfo")
-    if listing.is_file():
-        for line in listing.read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("model name"):
-                model = line.partition(":")[2].strip()
-                break
-    return f"{model}, {usable_cores()} cores, {platform.system()}"
+    return f"{processor()[0]}, {usable_cores()} cores, {platform.system()}"
 
 
 def peak_memory() -> float:

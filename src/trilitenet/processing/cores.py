@@ -1,4 +1,4 @@
-"""Processor cores: how many there are to work with, and processes that use them."""
+"""The processor: what it is, how many cores there are to work with, and processes that use them."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ import concurrent.futures
 import contextlib
 import multiprocessing
 import os
+import platform
+import re
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, TypeVar
 
 import cv2
 
-__all__ = ["ProcessPool", "held_back", "usable_cores"]
+__all__ = ["ProcessPool", "held_back", "processor", "usable_cores"]
 
 T = TypeVar("T")
 
@@ -22,6 +25,17 @@ T = TypeVar("T")
 def usable_cores() -> int:
     """Return on how many processor cores this process may run: `taskset` or a container's set of them may limit it."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def processor() -> tuple[str, frozenset[str]]:
+    """Return what the processor is called, and the names of its instructions as far as Linux tells."""
+    try:
+        listing = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        listing = ""
+    found = dict(re.findall(r"^(model name|flags)\s*: *(.*)$", listing, re.M))
+    name = found.get("model name") or platform.processor() or platform.machine()
+    return name, frozenset(found.get("flags", "").split())
 
 
 class ProcessPool(concurrent.futures.ProcessPoolExecutor):
