@@ -26,11 +26,11 @@ from trilitenet.data.synthetic import SyntheticScenes
 from trilitenet.data.transforms import EvalTransform
 from trilitenet.engine.ema import MovingAverage
 from trilitenet.engine.optim import build_optimiser
-from trilitenet.engine.runtime import keep_freed_memory
 from trilitenet.losses.detection import DetectionLoss
 from trilitenet.losses.multitask import MultiTaskLoss
 from trilitenet.models import activation
 from trilitenet.models.trilitenet import build_network, normalise_images
+from trilitenet.processing.memory import STEPS, keep_freed_memory
 
 WAYS = {"plain fp32": (True, False), "fp32": (False, False), "bf16": (False, True)}
 """Way -> whether it is the plain one, and whether it computes in bf16."""
@@ -87,7 +87,7 @@ def serve(pipe: Any, variant: str, way: str, options: argparse.Namespace) -> Non
     if plain:  # PyTorch's own layers
         activation._by_rows = lambda x: False
     if options.device == "cpu" and not (plain and options.allocator == "default"):
-        keep_freed_memory()  # as `trilitenet train` does
+        keep_freed_memory(STEPS)  # as `trilitenet train` does
     if options.threads:
         torch.set_num_threads(options.threads)
     scenes, canvas = SyntheticScenes(0), EvalTransform()

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import datetime
 import logging
 import os
 import platform
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -21,13 +19,11 @@ import torch
 
 from trilitenet.errors import BackendError, ConfigError, TrainingError, TriLiteNetError, import_extra
 from trilitenet.processing.cores import usable_cores
+from trilitenet.processing.memory import STEPS, keep_freed_memory
 
-__all__ = ["RESUME", "StopRequest", "follow", "keep_freed_memory", "pick_precision", "running_fabric"]
+__all__ = ["RESUME", "StopRequest", "follow", "pick_precision", "running_fabric"]
 
 log = logging.getLogger(__name__)
-
-_M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4
-"""Options of glibc's mallopt."""
 
 _PATIENCE: Final = datetime.timedelta(days=1)
 """Processes wait so long for each other."""
@@ -64,19 +60,6 @@ def _emulates(precision: str, device: str) -> bool:
     # Of an x86 with AVX-512, PyTorch says that it computes bf16 whether or not the processor has instructions for it.
     x86 = platform.machine().lower() in {"x86_64", "amd64"}
     return not (_has_bf16() if x86 else torch.ops.mkldnn._is_mkldnn_bf16_supported())
-
-
-def keep_freed_memory() -> None:
-    """Tell glibc to keep freed memory for the next step, which needs the same again: a CPU step is a tenth faster.
-
-    By default every large tensor is mapped anew and its pages are cleared. Other allocators and systems are left alone.
-    """
-    if not sys.platform.startswith("linux"):
-        return
-    with contextlib.suppress(OSError, AttributeError):
-        mallopt = ctypes.CDLL(None).mallopt
-        for option, value in ((_M_MMAP_MAX, 0), (_M_TRIM_THRESHOLD, 2**31 - 1), (_M_TOP_PAD, 2**28)):
-            mallopt(option, value)
 
 
 @contextlib.contextmanager
@@ -156,7 +139,7 @@ def _build_fabric(device: str, precision: str, devices: int, num_nodes: int) -> 
     if device == "auto":
         accelerator = "cuda" if torch.cuda.is_available() else "cpu"
     if accelerator == "cpu":
-        keep_freed_memory()
+        keep_freed_memory(STEPS)
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     settings: dict[str, Any] = {"devices": devices, "num_nodes": num_nodes}
     if devices != 1 or num_nodes != 1:

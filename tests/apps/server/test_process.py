@@ -6,7 +6,6 @@ import http.client
 import json
 import logging
 import os
-import platform
 import signal
 import socket
 import subprocess
@@ -593,31 +592,3 @@ def test_log_lines_are_json_with_the_fields() -> None:
     text = JsonFormatter().format(record)
     assert "\n" not in text
     assert "ValueError" in json.loads(text)["exception"]
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
-def test_the_memory_of_an_image_is_used_again() -> None:
-    script = """
-import resource, sys
-from concurrent.futures import ThreadPoolExecutor
-import numpy as np
-from trilitenet.apps.server.process import keep_freed_memory
-
-if sys.argv[1] == "keep":
-    assert keep_freed_memory()
-
-def picture(_):
-    return len([np.ones((720, 1280, 3), np.uint8) for _ in range(4)])
-
-with ThreadPoolExecutor(1) as pool:
-    list(pool.map(picture, range(10)))
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    list(pool.map(picture, range(10)))
-print((resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) // 10)
-"""
-    faults = {
-        how: int(subprocess.run([sys.executable, "-c", script, how], capture_output=True, check=True).stdout)
-        for how in ("keep", "as ever")
-    }
-    assert faults["keep"] < 50
-    assert faults["as ever"] > 500

@@ -71,9 +71,10 @@ def serve(
     import cv2
 
     from trilitenet.apps.server.application import create_app
-    from trilitenet.apps.server.process import build_server, keep_freed_memory, set_up_logs
+    from trilitenet.apps.server.process import build_server, set_up_logs
     from trilitenet.apps.server.settings import Settings
     from trilitenet.commands.load import load
+    from trilitenet.processing.memory import IMAGES, keep_freed_memory
 
     if log_level not in {"debug", "info", "warning", "error"}:
         raise ConfigError(f"log_level must be debug, info, warning or error, got {log_level!r}")
@@ -94,7 +95,7 @@ def serve(
     )
     listener = _listen(host, port)
     set_up_logs(log_level.upper())
-    keep_freed_memory()
+    keep_freed_memory(IMAGES)
     cv2.setNumThreads(1)  # images are the unit of parallel work here
     # The network's thread takes Python's lock often and briefly; with the usual 5 ms each other thread delays it.
     sys.setswitchinterval(0.0005)

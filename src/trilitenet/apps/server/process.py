@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ctypes
 import json
 import logging
 import re
@@ -22,7 +21,7 @@ from trilitenet.apps.server.application import Application
 from trilitenet.apps.server.metrics import Metrics
 from trilitenet.apps.server.settings import Settings
 
-__all__ = ["GuardedProtocol", "GuardedServer", "JsonFormatter", "build_server", "keep_freed_memory", "set_up_logs"]
+__all__ = ["GuardedProtocol", "GuardedServer", "JsonFormatter", "build_server", "set_up_logs"]
 
 logger = logging.getLogger("trilitenet.server")
 
@@ -37,10 +36,6 @@ _LAST_CALL: Final = 1.0
 
 _GRACE: Final = 0.1
 """Seconds more before headers count as late: on a busy machine they may lie unread since long."""
-
-_MALLOC: Final = ((-8, 2), (-3, 32 * 2**20), (-1, 128 * 2**20), (-2, 16 * 2**20))
-"""Options of glibc's ``mallopt``: arenas, the size from which memory is mapped, what is kept at the end of an arena,
-and how much it grows at once."""
 
 _TCP_USER_TIMEOUT: Final = getattr(socket, "TCP_USER_TIMEOUT", None)
 
@@ -388,16 +383,3 @@ def set_up_logs(level: str = "INFO") -> None:
     logging.basicConfig(level=level, handlers=[handler], force=True)
     logging.captureWarnings(True)
     logging.getLogger("PIL").setLevel(max(logging.INFO, logging.getLogger().level))  # below, it logs what EXIF says
-
-
-def keep_freed_memory() -> bool:
-    """Let glibc keep the memory of one image for the next, in few arenas.
-
-    By default it gives the buffers of each image back to the system and gets them again page by page: 4,500 faults for
-    a picture of 1280x720, a quarter of all processor time under load. Larger images are still given back at once.
-
-    Returns:
-        Whether the C library took the advice; one that is not glibc does not.
-    """
-    mallopt = getattr(ctypes.CDLL(None) if sys.platform == "linux" else None, "mallopt", None)
-    return mallopt is not None and all(mallopt(option, value) for option, value in _MALLOC)
