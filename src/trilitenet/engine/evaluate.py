@@ -51,7 +51,8 @@ LOWEST_CONFIDENCE: Final = 0.001
 
 _S = TypeVar("_S")
 _T = TypeVar("_T")
-Prediction = tuple[Perception | None, CanvasPrediction | None]
+_Read = tuple[LabelledImage, NDArray[np.uint8], Letterbox]
+_Look = Callable[[LabelledImage, RawOutputs, int, Letterbox], None]
 ImageChange = Callable[[NDArray[np.uint8], str], NDArray[np.uint8]]
 """Given an (H, W, 3) uint8 RGB image and its name, returns the image to show to the network, of the same size."""
 
@@ -157,25 +158,18 @@ def evaluate(
     )
     started = time.time()
     canvases: dict[tuple[int, int], None] = {}
-    count = _count(dataset, limit)
-    done = itertools.count(1)
-
-    def score(sample: LabelledImage, prediction: Prediction) -> None:
-        scorecard.add(sample, *prediction)
-        if progress is not None:
-            progress(next(done), count)
-        if on_prediction is not None and prediction[0] is not None:
-            on_prediction(sample, prediction[0])
-
     native = "fair" in protocols or on_prediction is not None
-    outputs = closing(_outputs(predictor, dataset, batch_size, limit, change))
-    with outputs as batches, _InOrder() as scoring:
-        for samples, letterboxes, raw in batches:
-            canvases.update(dict.fromkeys(letterbox.canvas for letterbox in letterboxes))
-            for index, (sample, letterbox) in enumerate(zip(samples, letterboxes, strict=True)):
-                scoring.submit(
-                    _score_one, score, sample, raw, index, letterbox, predictor.thresholds, card, native, protocols
-                )
+
+    def score(sample: LabelledImage, raw: RawOutputs, index: int, letterbox: Letterbox) -> None:
+        canvases[letterbox.canvas] = None
+        perception, canvas = _predictions(
+            raw, index, letterbox, predictor.thresholds, card, native=native, published="paper" in protocols
+        )
+        scorecard.add(sample, perception, canvas)
+        if on_prediction is not None and perception is not None:
+            on_prediction(sample, perception)
+
+    _look_at_each(predictor, dataset, batch_size, limit, score, progress, change)
     details = {
         "model": card.variant,
         "runtime": predictor.backend.name,
@@ -351,22 +345,22 @@ def _report(
     )
 
 
-def _score_one(
-    score: Callable[[LabelledImage, Prediction], None],
-    sample: LabelledImage,
+def _predictions(
     raw: RawOutputs,
     index: int,
     letterbox: Letterbox,
     thresholds: Thresholds,
     card: ModelCard,
+    *,
     native: bool,
-    protocols: Sequence[str],
-) -> None:
+    published: bool,
+) -> tuple[Perception | None, CanvasPrediction | None]:
+    """Return what an image of a batch is scored by: at its own size, and as published."""
     low = dataclasses.replace(thresholds, confidence=min(LOWEST_CONFIDENCE, thresholds.confidence))
     boxes = paper_boxes = None
     if raw.detection is not None:
         boxes = select_boxes(raw.detection[index], letterbox, low) if native else None
-        if "paper" in protocols:
+        if published:
             same = boxes is not None and (low.confidence, low.iou, low.max_boxes) == (
                 PAPER_THRESHOLDS.confidence,
                 PAPER_THRESHOLDS.iou,
@@ -382,15 +376,15 @@ def _score_one(
             drivable=None if raw.drivable is None else threshold_mask(raw.drivable[index], letterbox, low.drivable),
             lane=None if raw.lane is None else threshold_mask(raw.lane[index], letterbox, low.lane),
         )
-    if "paper" in protocols:
-        published = Letterbox.fit(letterbox.source)
+    if published:
+        fitted = Letterbox.fit(letterbox.source)
         canvas = CanvasPrediction(
             boxes=paper_boxes,
-            drivable=_argmax(raw.drivable, index, letterbox, published),
-            lane=_argmax(raw.lane, index, letterbox, published),
-            letterbox=published,
+            drivable=_argmax(raw.drivable, index, letterbox, fitted),
+            lane=_argmax(raw.lane, index, letterbox, fitted),
+            letterbox=fitted,
         )
-    score(sample, (perception, canvas))
+    return perception, canvas
 
 
 def _argmax(
@@ -448,8 +442,6 @@ def best_thresholds(
     """
     card = predictor.backend.card
     check_classes(card, dataset)
-    count = _count(dataset, limit)
-    done = itertools.count(1)
     low = dataclasses.replace(predictor.thresholds, confidence=LOWEST_CONFIDENCE)
     detection = DetectionMetric(card.class_names)
     counts: dict[Task, NDArray[np.int64]] = {
@@ -468,14 +460,8 @@ def best_thresholds(
             if masks is not None and truth is not None:
                 probability = letterbox.mask_to_source(masks[index])
                 counts[task] += _probability_counts(probability, truth, sample.counted(task))
-        if progress is not None:
-            progress(next(done), count)
 
-    outputs = closing(_outputs(predictor, dataset, batch_size, limit, None))
-    with outputs as batches, _InOrder() as looking:
-        for samples, letterboxes, raw in batches:
-            for index, (sample, letterbox) in enumerate(zip(samples, letterboxes, strict=True)):
-                looking.submit(look, sample, raw, index, letterbox)
+    _look_at_each(predictor, dataset, batch_size, limit, look, progress)
     drivable, drivable_iou = _best_cut(counts["drivable"], predictor.thresholds.drivable)
     lane, lane_iou = _best_cut(counts["lane"], predictor.thresholds.lane)
     confidence, f1 = _best_confidence(detection, predictor.thresholds.confidence)
@@ -516,44 +502,53 @@ def _best_confidence(detection: DetectionMetric, default: float) -> tuple[float,
     return round(float((best.confidence + below) / 2), 6), best.f1
 
 
-_Outputs = tuple[list[LabelledImage], list[Letterbox], RawOutputs]
-_Batch = list[tuple[LabelledImage, NDArray[np.uint8], Letterbox]]
-
-
-def _outputs(
+def _look_at_each(
     predictor: EvaluatedPredictor,
     dataset: LabelledImages,
     batch_size: int,
     limit: int | None,
-    change: ImageChange | None,
-) -> Generator[_Outputs, None, None]:
-    """Yield samples with what the network makes of them, in order.
+    look: _Look,
+    progress: Callable[[int, int], None] | None,
+    change: ImageChange | None = None,
+) -> None:
+    """Call ``look``, in order, with each sample, the outputs of its batch, its place in that, and its letterbox.
 
-    Reading and letterboxing go ahead in a thread of their own. Where the backend can, several threads compute a batch
-    each on cores of their own: scoring beside a network that has all cores would make each of its layers wait.
+    Reading and letterboxing go ahead in a thread of their own, looking follows in another. Where the backend can,
+    several threads compute a batch each on cores of their own: scoring beside a network that has all cores would make
+    each of its layers wait.
     """
     count = _count(dataset, limit)
     if count < 1 or batch_size < 1:
         raise DataError(f"no images to evaluate on (images {count}, batch size {batch_size})")
     backend = predictor.backend
+    done = itertools.count(1)
 
-    def prepare(index: int) -> tuple[LabelledImage, NDArray[np.uint8], Letterbox]:
+    def prepare(index: int) -> _Read:
         sample = dataset[index]
         image = sample.image if change is None else change(sample.image, sample.name)
         return sample, *predictor.preprocess(image)
 
-    def run(batch: _Batch) -> _Outputs:
-        samples, canvases, letterboxes = zip(*batch, strict=True)
-        return list(samples), list(letterboxes), backend.run(_stack(canvases))
+    def run(batch: list[_Read]) -> tuple[list[_Read], RawOutputs]:
+        canvases = [canvas for _, canvas, _ in batch]
+        return batch, backend.run(canvases[0][None] if len(canvases) == 1 else np.stack(canvases))
+
+    def look_at(sample: LabelledImage, raw: RawOutputs, index: int, letterbox: Letterbox) -> None:
+        look(sample, raw, index, letterbox)
+        if progress is not None:
+            progress(next(done), count)
 
     with backend.in_parallel() if isinstance(backend, RunsInParallel) else nullcontext(1) as runners:
         read = _ahead(prepare, range(count), batch_size * (runners + 1) + 1, "reader")
-        yield from _ahead(run, _batches(read, batch_size), runners, "network", runners)
+        outputs = closing(_ahead(run, _batches(read, batch_size), runners, "network", runners))
+        with outputs as batches, _InOrder() as looking:
+            for batch, raw in batches:
+                for index, (sample, _, letterbox) in enumerate(batch):
+                    looking.submit(look_at, sample, raw, index, letterbox)
 
 
-def _batches(read: Iterable[tuple[LabelledImage, NDArray[np.uint8], Letterbox]], batch_size: int) -> Iterator[_Batch]:
+def _batches(read: Iterable[_Read], batch_size: int) -> Iterator[list[_Read]]:
     """Gather images that follow each other and have a canvas of one size."""
-    batch: _Batch = []
+    batch: list[_Read] = []
     for one in read:
         if batch and (len(batch) == batch_size or one[1].shape != batch[0][1].shape):
             yield batch
@@ -563,11 +558,9 @@ def _batches(read: Iterable[tuple[LabelledImage, NDArray[np.uint8], Letterbox]],
         yield batch
 
 
-def _stack(canvases: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    return canvases[0][None] if len(canvases) == 1 else np.stack(canvases)
-
-
-def _ahead(prepare: Callable[[_S], _T], order: Iterable[_S], depth: int, name: str, threads: int = 1) -> Iterator[_T]:
+def _ahead(
+    prepare: Callable[[_S], _T], order: Iterable[_S], depth: int, name: str, threads: int = 1
+) -> Generator[_T, None, None]:
     """Yield what threads prepare of each, in order, up to ``depth`` ahead."""
     with ThreadPoolExecutor(threads, thread_name_prefix=name) as pool:
         waiting: collections.deque[Future[_T]] = collections.deque()
