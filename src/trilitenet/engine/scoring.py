@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import Task
+from trilitenet.config import TASKS, Task
 from trilitenet.errors import ShapeError
 from trilitenet.metrics.detection import DetectionMetric, DetectionScores
 from trilitenet.metrics.lane import LaneMetric, LaneScores
@@ -141,8 +141,11 @@ class _ByTask:
         }
 
     def _by_task(self) -> dict[Task, Any]:
-        metrics: dict[Task, Any] = {"detection": self.detection, "drivable": self.drivable, "lane": self.lane}
-        return {task: metric for task, metric in metrics.items() if metric is not None}
+        return {task: metric for task in TASKS if (metric := getattr(self, task)) is not None}
+
+    def _scores(self) -> dict[Task, Any]:
+        metrics = self._by_task()
+        return {task: metrics[task].compute() if task in metrics else None for task in TASKS}
 
 
 class FairMetrics(_ByTask):
@@ -153,8 +156,6 @@ class FairMetrics(_ByTask):
         tasks: Tasks to score.
         confidence: The stated confidence for precision, recall and F1 of detection.
     """
-
-    name = "fair"
 
     def __init__(self, class_names: Sequence[str], tasks: Sequence[Task], *, confidence: float = 0.25) -> None:
         self.detection = DetectionMetric(class_names, confidence) if "detection" in tasks else None
@@ -194,11 +195,7 @@ class FairMetrics(_ByTask):
 
     def compute(self) -> FairScores:
         """Return the scores over all images."""
-        return FairScores(
-            detection=None if self.detection is None else self.detection.compute(),
-            drivable=None if self.drivable is None else self.drivable.compute(),
-            lane=None if self.lane is None else self.lane.compute(),
-        )
+        return FairScores(**self._scores())
 
     def state(self) -> dict[str, Any]:
         """Return what was kept of each image, as ``json.dumps`` takes it."""
@@ -260,8 +257,6 @@ class PaperMetrics(_ByTask):
         batch_size: Images a batch of the averages.
     """
 
-    name = "paper"
-
     def __init__(self, classes: int, tasks: Sequence[Task], *, batch_size: int = 16) -> None:
         self.batch_size = batch_size
         self.detection = PublishedDetection(classes) if "detection" in tasks else None
@@ -294,12 +289,7 @@ class PaperMetrics(_ByTask):
 
     def compute(self) -> PaperScores:
         """Return the scores over all images."""
-        return PaperScores(
-            batch_size=self.batch_size,
-            detection=None if self.detection is None else self.detection.compute(),
-            drivable=None if self.drivable is None else self.drivable.compute(),
-            lane=None if self.lane is None else self.lane.compute(),
-        )
+        return PaperScores(self.batch_size, **self._scores())
 
     def state(self) -> dict[str, Any]:
         """Return what was kept of each image, as ``json.dumps`` takes it."""
