@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from rich import box
 from rich.table import Table
 from rich.text import Text
 
@@ -19,7 +18,7 @@ from trilitenet.config import Task
 from trilitenet.engine.figures import HEADLINES, meaning
 from trilitenet.engine.page import escape, interval_plot, page, percent, section, table
 from trilitenet.engine.published_rows import PUBLISHED_ROWS, PublishedRow
-from trilitenet.engine.report import SAVED, Report, render, without_nan
+from trilitenet.engine.report import SAVED, Report, render, titled_table, without_nan
 from trilitenet.errors import ConfigError, write_file
 from trilitenet.metrics.bootstrap import bootstrap, interval
 
@@ -232,7 +231,7 @@ def _keys(comparison: Comparison) -> list[str]:
 
 
 def _figure_table(comparison: Comparison) -> Table:
-    shown = Table(title="figures (per cent)", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+    shown = titled_table("figures (per cent)")
     shown.add_column("figure")
     for name in comparison.names:
         shown.add_column(name, justify="right")
@@ -251,9 +250,7 @@ def _figure_table(comparison: Comparison) -> Table:
 
 def _published_table(comparison: Comparison) -> list[Table | Text]:
     keys = list(comparison.published[0].figures)
-    shown = Table(
-        title="beside published rows (per cent)", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold"
-    )
+    shown = titled_table("beside published rows (per cent)")
     shown.add_column("model")
     for key in keys:
         shown.add_column(_label(key).removeprefix("paper "), justify="right")

@@ -279,10 +279,13 @@ def render(parts: list[Any]) -> str:
     return buffer.getvalue().rstrip()
 
 
+def titled_table(title: str) -> Table:
+    """Return a table without columns."""
+    return Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+
+
 def _figure_table(protocol: str, figures: Mapping[str, Figure]) -> Table:
-    table = Table(
-        title=f"{protocol} protocol (per cent)", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold"
-    )
+    table = titled_table(f"{protocol} protocol (per cent)")
     table.add_column("task")
     table.add_column("figure", no_wrap=True)
     table.add_column("value", justify="right")
@@ -302,12 +305,7 @@ def _figure_table(protocol: str, figures: Mapping[str, Figure]) -> Table:
 
 def _condition_table(protocol: str, conditions: tuple[Condition, ...]) -> Table:
     keys = [key for key in CONDITION_FIGURES[protocol] if any(key in row.figures for row in conditions)]
-    table = Table(
-        title=f"by condition, {protocol} (per cent; in brackets: under {FEW_IMAGES} images)",
-        box=box.SIMPLE_HEAD,
-        title_justify="left",
-        title_style="bold",
-    )
+    table = titled_table(f"by condition, {protocol} (per cent; in brackets: under {FEW_IMAGES} images)")
     table.add_column("condition")
     table.add_column("value")
     table.add_column("images", justify="right")
@@ -334,7 +332,7 @@ def _variation_tables(variations: tuple[Variation, ...]) -> list[Table]:
     for kind in dict.fromkeys(variation.kind for variation in variations):
         members = [variation for variation in variations if variation.kind == kind and not variation.detail]
         keys = [key for key in HEADLINES if key in members[0].figures]
-        table = Table(title=f"{kind} (per cent)", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+        table = titled_table(f"{kind} (per cent)")
         table.add_column("")
         for key in keys:
             table.add_column(f"{key.split('/')[1]} {meaning(key).title}", justify="right")
