@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -338,7 +338,7 @@ def _page_published(comparison: Comparison) -> str:
     )
     rows = [
         f"<tr><td><b>{escape(name)}</b><span class=note>measured here, on {escape(comparison.data[name])}</span></td>"
-        + _cells([comparison.figures[name].get(key) for key in keys])
+        + "".join(f'<td class="n">{percent(comparison.figures[name].get(key))}</td>' for key in keys)
         + "</tr>"
         for name in comparison.names
     ]
@@ -349,7 +349,3 @@ def _page_published(comparison: Comparison) -> str:
         for row in comparison.published
     ]
     return table(head, "".join(rows))
-
-
-def _cells(values: Sequence[float | None]) -> str:
-    return "".join(f'<td class="n">{percent(value)}</td>' for value in values)
