@@ -44,7 +44,7 @@ def test_thresholds_can_be_overridden_one_by_one(weights: Path) -> None:
 
 def test_a_model_whose_thresholds_are_refused_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     backend = ColourBackend()
-    monkeypatch.setattr("trilitenet.commands.load._open", lambda *_: backend)
+    monkeypatch.setattr("trilitenet.commands.load.open_backend", lambda *_: backend)
     with pytest.raises(ConfigError, match="confidence must be between 0 and 1"):
         trilitenet.load("a.onnx", confidence=7)
     assert backend.closed == 1

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch.nn.functional import interpolate
 
 import trilitenet
+from trilitenet.commands.load import open_backend
 from trilitenet.commands.paths import check_writable, text_paths
 from trilitenet.config import ARTEFACT_KEY, ARTEFACT_SUFFIXES, CARD_KEY, ArtefactInfo, Task, check_size
 from trilitenet.data.reading import IMAGE_ENDINGS, DrivingDataset
@@ -66,6 +67,8 @@ PRECISIONS: Final[dict[str, tuple[Precision, ...]]] = {
     "triton": ("fp32", "fp16", "int8"),
 }
 """Precisions of a format."""
+_RUNTIMES: Final = {"onnx": "onnxruntime"}
+"""Runtimes that are not called as their format is."""
 DROP_FRAMES: Final = 150
 """The drop of INT8 is measured on at most so many images, spread evenly over the val split."""
 DROP_SCORES: Final[dict[Task, str]] = {
@@ -201,7 +204,7 @@ def export(
         nms=nms,
         trilitenet=trilitenet.__version__,
     )
-    runtime = "planar" if portable else {"onnx": "onnxruntime"}.get(format, format)
+    runtime = "planar" if portable else _RUNTIMES.get(format, format)
     graph = DeployGraph(
         network,
         pick_layout(layout, network.variant, runtime, unit=vector_unit()),
@@ -412,25 +415,7 @@ def _trial(path: Path) -> Iterator[Path]:
 
 
 def _open(path: Path, info: ArtefactInfo) -> Backend:
-    if info.format == "openvino":
-        from trilitenet.inference.openvino_backend import OpenVINOBackend
-
-        return OpenVINOBackend(path)
-    if info.format == "ncnn":
-        from trilitenet.inference.ncnn_backend import NcnnBackend
-
-        return NcnnBackend(path)
-    if info.format == "torch":
-        from trilitenet.inference.exported_torch_backend import ExportedTorchBackend
-
-        return ExportedTorchBackend(path, "cpu")
-    if info.format == "tensorrt":  # pragma: no cover - needs a GPU and TensorRT
-        from trilitenet.inference.tensorrt_backend import TensorRTBackend
-
-        return TensorRTBackend(path)
-    from trilitenet.inference.onnx_backend import OnnxBackend
-
-    return OnnxBackend(path, "cpu")
+    return open_backend(path, "cpu", _RUNTIMES.get(info.format, info.format))
 
 
 def _compare(network: TriLiteNet, backend: Backend, info: ArtefactInfo, checks: Sequence[NDArray[np.uint8]]) -> Parity:

@@ -14,7 +14,7 @@ from trilitenet.inference.backend import Backend
 from trilitenet.inference.exported import is_int8_onnx
 from trilitenet.inference.predictor import Predictor
 
-__all__ = ["BACKENDS", "load"]
+__all__ = ["BACKENDS", "load", "open_backend"]
 
 BACKENDS = ("auto", "torch", "onnxruntime", "openvino", "ncnn", "tensorrt")
 """What ``backend`` may be."""
@@ -75,7 +75,7 @@ def load(
     if streams < 1 or (threads is not None and threads < 1):
         raise ConfigError(f"streams and threads must be at least 1, got {streams} and {threads}")
     with needing_torch():
-        runtime = _open(model, device, backend, streams, threads)
+        runtime = open_backend(model, device, backend, streams, threads)
     try:
         thresholds = _override(runtime.card, confidence=confidence, iou=iou, drivable=drivable, lane=lane)
         return Predictor(runtime, thresholds, long_side=long_side, batch_size=batch_size)
@@ -84,7 +84,9 @@ def load(
         raise ConfigError(f"{model}: {error}") from error
 
 
-def _open(model: str | os.PathLike[str], device: str, backend: str, streams: int, threads: int | None) -> Backend:
+def open_backend(
+    model: str | os.PathLike[str], device: str, backend: str, streams: int = 1, threads: int | None = None
+) -> Backend:
     """Open a file on the runtime asked for, or on the fastest one here that runs it."""
     suffix, fastest = Path(model).suffix.lower(), backend == "auto"
     if str(model) not in VARIANTS and Path(model).is_dir() and any(Path(model).glob("*.param")):
