@@ -394,7 +394,8 @@ def _keep(
         _write(built, trial, network, info)
         with contextlib.closing(_open(trial, info)) as backend:
             parity = _compare(network, backend, info, checks)
-        _require(parity, path)
+        if parity.failures:
+            raise BackendError(f"{path}: not written, it differs from the network: {'; '.join(parity.failures)}")
     return Exported(path, info, parity)
 
 
@@ -471,11 +472,6 @@ class _Suppressed:
         rows, class_id, scores = rows[above], class_id[above], scores[above]
         kept = nms(cxcywh_to_xyxy(rows[:, :4]), scores, class_id, thresholds.iou, thresholds.max_boxes)
         return dataclasses.replace(raw, detection=rows[kept][None])
-
-
-def _require(parity: Parity, path: Path) -> None:
-    if parity.failures:
-        raise BackendError(f"{path}: not written, it differs from the network: {'; '.join(parity.failures)}")
 
 
 class _Drop:
