@@ -499,14 +499,10 @@ def _some_pictures(report: CheckReport, count: int) -> Any:
 
 def _all_fitted(dataset: DrivingDataset, indices: Iterable[int], width: int) -> Iterator[Any]:
     """Yield the drawn images one by one: a page needs but one of them at a time."""
-    return (_fitted(dataset, index, width) for index in indices)
-
-
-def _fitted(dataset: DrivingDataset, index: int, width: int) -> Any:
-    sample = dataset[index]
-    drawn = draw_sample(sample, dataset.class_names)
-    box = Letterbox.fit(sample.size, long_side=width, stride=1)
-    return box.image(drawn)
+    for index in indices:
+        sample = dataset[index]
+        box = Letterbox.fit(sample.size, long_side=width, stride=1)
+        yield box.image(draw_sample(sample, dataset.class_names))
 
 
 def _workers(workers: int) -> int:
