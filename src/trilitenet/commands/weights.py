@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import sys
@@ -11,13 +10,13 @@ from pathlib import Path
 
 from trilitenet.commands.evaluate import check_counts
 from trilitenet.commands.load import load
-from trilitenet.commands.paths import text_paths
+from trilitenet.commands.paths import check_writable, text_paths
 from trilitenet.commands.progress import show_progress
 from trilitenet.config import ModelCard, check_size, parse, read_yaml
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.evaluate import best_thresholds
 from trilitenet.engine.evaluate import evaluate as run_evaluation
-from trilitenet.errors import ConfigError, OutputError
+from trilitenet.errors import ConfigError, OutputError, scratch_folder
 from trilitenet.models.weights import import_published, load_network, read_card, resolve_weights, save_network
 
 __all__ = ["CardText", "finish", "import_weights", "info"]
@@ -105,6 +104,7 @@ def finish(
         raise ConfigError(f"{destination}: weights end with .safetensors")
     if destination.exists() and not overwrite:
         raise OutputError(f"{destination}: exists already; give another name or --overwrite")
+    check_writable(destination)
     if input_size is not None:
         check_size(input_size, "--input-size")
     check_counts(0, batch_size=batch_size)
@@ -115,8 +115,8 @@ def finish(
     if iou is not None:
         described = dataclasses.replace(described, thresholds=dataclasses.replace(described.thresholds, iou=iou))
     dataset = DrivingDataset(data, split, class_names=described.class_names)
-    draft = destination.with_name(f".{destination.stem}.draft.safetensors")
-    try:
+    with scratch_folder() as folder:
+        draft = folder / "draft.safetensors"
         # Measured as stored: what the user loads is what the figures are of.
         save_network(network, draft, dataclasses.replace(described, metrics={}), half=not full)
         with load(draft) as predictor, show_progress("thresholds") as shown:
@@ -135,9 +135,6 @@ def finish(
         figures = {f"{split} {name}": round(figure.value, 4) for name, figure in report.figures.items()}
         finished = dataclasses.replace(described, thresholds=best.thresholds, metrics=figures)
         save_network(network, destination, finished, half=not full)
-    finally:
-        with contextlib.suppress(OSError):  # what went wrong before is the one to tell
-            draft.unlink(missing_ok=True)
     sys.stdout.write(f"{report.summary()}\nwritten to {destination}\n")
     return finished
 
