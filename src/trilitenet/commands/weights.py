@@ -12,7 +12,7 @@ from trilitenet.commands.evaluate import check_counts
 from trilitenet.commands.load import load
 from trilitenet.commands.paths import check_writable, text_paths
 from trilitenet.commands.progress import show_progress
-from trilitenet.config import ModelCard, check_size, parse, read_yaml
+from trilitenet.config import STRIDES, ModelCard, check_size, parse, read_yaml
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.evaluate import best_thresholds
 from trilitenet.engine.evaluate import evaluate as run_evaluation
@@ -109,7 +109,7 @@ def finish(
         check_size(input_size, "--input-size")
     check_counts(0, batch_size=batch_size)
     network = load_network(source)
-    described = _describe(network.card, [_read_card_text(path) for path in card])
+    described = _describe(network.card, [parse(CardText, read_yaml(path), str(path)) for path in card])
     if input_size is not None:
         described = dataclasses.replace(described, input_size=input_size)
     if iou is not None:
@@ -137,10 +137,6 @@ def finish(
         save_network(network, destination, finished, half=not full)
     sys.stdout.write(f"{report.summary()}\nwritten to {destination}\n")
     return finished
-
-
-def _read_card_text(path: Path) -> CardText:
-    return parse(CardText, read_yaml(path), str(path))
 
 
 def _describe(card: ModelCard, texts: Sequence[CardText]) -> ModelCard:
@@ -180,7 +176,7 @@ def info(file: str, /, *, json_output: bool = False) -> ModelCard:
         ("input", f"{card.input_size[1]}x{card.input_size[0]} RGB, mean {card.mean}, std {card.std}"),
         *(
             (f"anchors 1/{stride}", ", ".join(f"{width:g}x{height:g}" for width, height in level))
-            for stride, level in zip((8, 16, 32), card.anchors, strict=True)
+            for stride, level in zip(STRIDES, card.anchors, strict=True)
         ),
         (
             "thresholds",
