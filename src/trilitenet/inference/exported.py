@@ -1,10 +1,11 @@
-"""What backends of exported artefacts share: reading their metadata, their input and their outputs."""
+"""What backends of exported artefacts share: their metadata, their input, and their outputs gathered."""
 
 from __future__ import annotations
 
+import abc
 import os
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from trilitenet.errors import BackendError, ShapeError, TriLiteNetError, Weights
 from trilitenet.inference.backend import check_batch
 from trilitenet.structures import RawOutputs
 
-__all__ = ["check_graph", "is_int8_onnx", "prepare_input", "read_metadata", "run_images"]
+__all__ = ["ArtefactBackend", "check_graph", "is_int8_onnx", "prepare_input", "read_metadata"]
 
 _METADATA_BYTES = 1 << 16
 
@@ -99,51 +100,65 @@ def prepare_input(image: NDArray[np.uint8], info: ArtefactInfo) -> NDArray[Any]:
     return np.ascontiguousarray(image[None])
 
 
-def run_images(
-    batch: NDArray[np.uint8],
-    card: ModelCard,
-    outputs: Callable[[], list[Mapping[str, NDArray[Any]]]],
-    info: ArtefactInfo,
-) -> RawOutputs:
-    """Check a batch, run it, and gather what an artefact returns for each image.
+class ArtefactBackend(abc.ABC):
+    """An exported artefact on a runtime.
 
-    Args:
-        batch: (B, H, W, 3) uint8 RGB.
-        card: Its tasks say which outputs there are.
-        outputs: Runs the batch; a mapping from output name to array with a leading 1, for each image.
-        info: The size it takes, and how masks are to be read.
-
-    Raises:
-        ShapeError: If the batch is empty, or of another shape or type, or of a size the artefact cannot take.
-        BackendError: If the runtime fails.
-        WeightsError: If the card is of another graph.
+    Attributes:
+        info: How the artefact takes pixels and returns results.
     """
-    check_batch(batch, MAX_STRIDE if info.size is None else 1)
-    try:
-        results = outputs()
-    except TriLiteNetError:
-        raise
-    except Exception as error:  # what runtimes raise shares no base class
-        raise BackendError(f"the runtime failed ({' '.join(str(error).split())[:160]})") from error
 
-    def mask(name: str) -> NDArray[np.uint8] | None:
-        if name not in card.tasks:
-            return None
-        return np.concatenate([_probability(result[name], info) for result in results])
+    info: ArtefactInfo
+    _card: ModelCard
 
-    detection = None
-    if "detection" in card.tasks:
-        rows = [np.asarray(result["detection"], np.float32) for result in results]
-        if any(row.shape[-1] != 5 + card.classes for row in rows):
-            raise WeightsError(
-                f"the card names {card.classes} classes, but the graph gives rows of {rows[0].shape[-1]} numbers, "
-                f"not {5 + card.classes}; the file is damaged"
-            )
-        rows = [row.reshape(-1, 5 + card.classes) for row in rows]
-        detection = np.zeros((len(rows), max(len(row) for row in rows), 5 + card.classes), np.float32)
-        for padded, row in zip(detection, rows, strict=True):  # after suppression, images have different counts
-            padded[: len(row)] = row
-    return RawOutputs(detection, mask("drivable"), mask("lane"))
+    @property
+    def card(self) -> ModelCard:
+        """What the network is."""
+        return self._card
+
+    @property
+    def canvas(self) -> tuple[int, int] | None:
+        """The artefact's input size, None if it is dynamic."""
+        return self.info.size
+
+    @abc.abstractmethod
+    def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
+        """Return for each image the name of each output -> array with a leading 1."""
+
+    def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
+        """Run the network on (B, H, W, 3) uint8 RGB; see `Backend.run`.
+
+        Raises:
+            ShapeError: If the batch is empty, or of another shape or type, or of a size the artefact cannot take.
+            BackendError: If the runtime fails.
+            WeightsError: If the card is of another graph.
+        """
+        card, info = self._card, self.info
+        check_batch(batch, MAX_STRIDE if info.size is None else 1)
+        try:
+            results = self._compute(batch)
+        except TriLiteNetError:
+            raise
+        except Exception as error:  # what runtimes raise shares no base class
+            raise BackendError(f"the runtime failed ({' '.join(str(error).split())[:160]})") from error
+
+        def mask(name: str) -> NDArray[np.uint8] | None:
+            if name not in card.tasks:
+                return None
+            return np.concatenate([_probability(result[name], info) for result in results])
+
+        detection = None
+        if "detection" in card.tasks:
+            rows = [np.asarray(result["detection"], np.float32) for result in results]
+            if any(row.shape[-1] != 5 + card.classes for row in rows):
+                raise WeightsError(
+                    f"the card names {card.classes} classes, but the graph gives rows of {rows[0].shape[-1]} numbers, "
+                    f"not {5 + card.classes}; the file is damaged"
+                )
+            rows = [row.reshape(-1, 5 + card.classes) for row in rows]
+            detection = np.zeros((len(rows), max(len(row) for row in rows), 5 + card.classes), np.float32)
+            for padded, row in zip(detection, rows, strict=True):  # after suppression, images have different counts
+                padded[: len(row)] = row
+        return RawOutputs(detection, mask("drivable"), mask("lane"))
 
 
 def _probability(mask: NDArray[Any], info: ArtefactInfo) -> NDArray[np.uint8]:

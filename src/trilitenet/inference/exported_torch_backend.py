@@ -12,17 +12,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ModelCard
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY
 from trilitenet.errors import ShapeError, WeightsError
-from trilitenet.inference.exported import prepare_input, read_metadata, run_images
+from trilitenet.inference.exported import ArtefactBackend, prepare_input, read_metadata
 from trilitenet.inference.torch_backend import pick_device
-from trilitenet.structures import RawOutputs
 
 __all__ = ["ExportedTorchBackend"]
 
 
-class ExportedTorchBackend:
-    """An artefact of ``trilitenet export --format torch``.
+class ExportedTorchBackend(ArtefactBackend):
+    """An artefact of ``trilitenet export --format torch``; one of any size takes sides from 64 pixels on.
 
     Args:
         path: The ``.pt2`` file.
@@ -59,44 +58,29 @@ class ExportedTorchBackend:
         return ExportedTorchBackend, (self._path.absolute(), str(self.device))
 
     @property
-    def card(self) -> ModelCard:
-        """What the network is."""
-        return self._card
-
-    @property
     def name(self) -> str:
         """The runtime and the device."""
         return f"torch program {self.device}"
 
-    @property
-    def canvas(self) -> tuple[int, int] | None:
-        """The artefact's input size, None if it is dynamic."""
-        return self.info.size
-
-    def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
-        """Run the network on (B, H, W, 3) uint8 RGB, if it is dynamic from 64 pixels on; see `Backend.run`."""
-
-        def outputs() -> list[Mapping[str, NDArray[Any]]]:
-            height, width = batch.shape[1:3]
-            if self.info.size is None and min(height, width) < 64:
-                raise ShapeError(
-                    f"a dynamic .pt2 takes sides from 64 pixels, got {width}x{height}: use the weights, or export it "
-                    "with a fixed --size"
-                )
-            with torch.no_grad():
-                return [
-                    {
-                        name: value.cpu().numpy()
-                        for name, value in zip(
-                            self._card.tasks,
-                            self._module(torch.from_numpy(prepare_input(image, self.info)).to(self.device)),
-                            strict=True,
-                        )
-                    }
-                    for image in batch
-                ]
-
-        return run_images(batch, self._card, outputs, self.info)
+    def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
+        height, width = batch.shape[1:3]
+        if self.info.size is None and min(height, width) < 64:
+            raise ShapeError(
+                f"a dynamic .pt2 takes sides from 64 pixels, got {width}x{height}: use the weights, or export it "
+                "with a fixed --size"
+            )
+        with torch.no_grad():
+            return [
+                {
+                    name: value.cpu().numpy()
+                    for name, value in zip(
+                        self._card.tasks,
+                        self._module(torch.from_numpy(prepare_input(image, self.info)).to(self.device)),
+                        strict=True,
+                    )
+                }
+                for image in batch
+            ]
 
     def close(self) -> None:
         """Nothing to free."""

@@ -16,15 +16,14 @@ from numpy.typing import NDArray
 from trilitenet.config import GRAPH_HASH_KEY, WEIGHTS_HASH_KEY, ArtefactInfo, ModelCard, parse_json
 from trilitenet.errors import BackendError, ConfigError, WeightsError, import_extra
 from trilitenet.inference.backend import ParallelSessions, check_process
-from trilitenet.inference.exported import prepare_input, read_metadata, run_images
-from trilitenet.structures import RawOutputs
+from trilitenet.inference.exported import ArtefactBackend, prepare_input, read_metadata
 
 __all__ = ["NcnnBackend"]
 
 _MAGIC: Final = b"7767517"
 
 
-class NcnnBackend(ParallelSessions):
+class NcnnBackend(ParallelSessions, ArtefactBackend):
     """An artefact of ``trilitenet export --format ncnn`` on NCNN, on the CPU.
 
     Args:
@@ -35,7 +34,6 @@ class NcnnBackend(ParallelSessions):
         threads: Threads; NCNN's own choice if left out.
 
     Attributes:
-        info: How the artefact takes pixels and returns results.
         precision: What it computes in.
 
     Raises:
@@ -86,27 +84,16 @@ class NcnnBackend(ParallelSessions):
         ), ()
 
     @property
-    def card(self) -> ModelCard:
-        """What the network is."""
-        return self._card
-
-    @property
     def name(self) -> str:
         """The runtime, the device and the precision."""
         return f"ncnn cpu {self.precision}"
 
-    @property
-    def canvas(self) -> tuple[int, int] | None:
-        """The artefact's input size."""
-        return self.info.size
-
-    def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
-        """Run the network on (B, H, W, 3) uint8 RGB, image by image; see `Backend.run`."""
+    def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
         net = self._session
         if net is None:
             raise BackendError(f"{self._path}: the model was closed")
         check_process(self._process)
-        return run_images(batch, self._card, lambda: [self._run(net, image) for image in batch], self.info)
+        return [self._run(net, image) for image in batch]
 
     def _run(self, net: Any, image: NDArray[np.uint8]) -> Mapping[str, NDArray[Any]]:
         planes = prepare_input(image, self.info)[0]  # named, for the Mat borrows its memory without keeping it alive

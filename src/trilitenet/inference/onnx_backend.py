@@ -11,25 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import ModelCard
 from trilitenet.errors import BackendError, WeightsError, import_extra
 from trilitenet.inference.backend import ParallelSessions
-from trilitenet.inference.exported import check_graph, prepare_input, read_metadata, run_images
-from trilitenet.structures import RawOutputs
+from trilitenet.inference.exported import ArtefactBackend, check_graph, prepare_input, read_metadata
 
 __all__ = ["OnnxBackend"]
 
 
-class OnnxBackend(ParallelSessions):
+class OnnxBackend(ParallelSessions, ArtefactBackend):
     """An artefact of ``trilitenet export --format onnx`` on ONNX Runtime.
 
     Args:
         path: The ``.onnx`` file.
         device: ``"auto"`` (CUDA where this ONNX Runtime has it), ``"cpu"`` or ``"cuda"``.
         threads: Threads of the CPU provider; ONNX Runtime's own choice if left out.
-
-    Attributes:
-        info: How the artefact takes pixels and returns results.
 
     Raises:
         MissingExtraError: If ONNX Runtime is not installed.
@@ -78,36 +73,13 @@ class OnnxBackend(ParallelSessions):
         return functools.partial(OnnxBackend, self._path.absolute(), self._device, threads=self._threads), ()
 
     @property
-    def card(self) -> ModelCard:
-        """What the network is."""
-        return self._card
-
-    @property
     def name(self) -> str:
         """The runtime and the device."""
         return f"onnxruntime {self._device} {self.info.precision}"
 
-    @property
-    def canvas(self) -> tuple[int, int] | None:
-        """The artefact's input size, None if it is dynamic."""
-        return self.info.size
-
-    def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
-        """Run the network on (B, H, W, 3) uint8 RGB; see `Backend.run`."""
-
-        def outputs() -> list[Mapping[str, NDArray[Any]]]:
-            return [
-                dict(
-                    zip(
-                        self._outputs,
-                        self._session.run(None, {self._input: prepare_input(image, self.info)}),
-                        strict=True,
-                    )
-                )
-                for image in batch
-            ]
-
-        return run_images(batch, self._card, outputs, self.info)
+    def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
+        runs = (self._session.run(None, {self._input: prepare_input(image, self.info)}) for image in batch)
+        return [dict(zip(self._outputs, values, strict=True)) for values in runs]
 
     def close(self) -> None:
         """Nothing to free before the object goes."""

@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ModelCard
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY
 from trilitenet.errors import BackendError, ConfigError, WeightsError, import_extra
 from trilitenet.inference.backend import MOST_PARALLEL, check_process, replaced
-from trilitenet.inference.exported import check_graph, prepare_input, read_metadata, run_images
+from trilitenet.inference.exported import ArtefactBackend, check_graph, prepare_input, read_metadata
 from trilitenet.processing.cores import usable_cores
-from trilitenet.structures import RawOutputs
 
 __all__ = ["OpenVINOBackend", "openvino_core"]
 
@@ -28,7 +27,7 @@ _FIRST_USE = threading.Lock()
 _HINTS = {"fp32": "f32", "fp16": "f16", "bf16": "bf16"}
 
 
-class OpenVINOBackend:
+class OpenVINOBackend(ArtefactBackend):
     """An artefact of ``trilitenet export --format openvino`` (or ``onnx``) on OpenVINO.
 
     Args:
@@ -40,7 +39,6 @@ class OpenVINOBackend:
         threads: Threads in all; OpenVINO's own choice if left out.
 
     Attributes:
-        info: How the artefact takes pixels and returns results.
         precision: What it computes in; bf16 falls back to fp32 where the processor lacks it.
 
     Raises:
@@ -138,56 +136,42 @@ class OpenVINOBackend:
         return reopen, ()
 
     @property
-    def card(self) -> ModelCard:
-        """What the network is."""
-        return self._card
-
-    @property
     def name(self) -> str:
         """The runtime, the device, the precision and the streams."""
         precision = "int8" if self.info.precision == "int8" else self.precision
         return f"openvino {self._device.lower()} {precision}" + (f" x{self.streams}" if self.streams > 1 else "")
 
-    @property
-    def canvas(self) -> tuple[int, int] | None:
-        """The artefact's input size, None if it is dynamic."""
-        return self.info.size
-
-    def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
-        """Run the network on (B, H, W, 3) uint8 RGB; images of a batch share the streams. See `Backend.run`."""
+    def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
+        """Compute the images of a batch at once, as far as there are streams."""
         idle = self._idle
         if idle is None:
             raise BackendError(f"{self._path}: the model was closed")
         check_process(self._process)
-
-        def outputs() -> list[Mapping[str, NDArray[Any]]]:
-            results: list[Mapping[str, NDArray[Any]]] = []
-            inputs = collections.deque(prepare_input(image, self.info) for image in batch)
-            while inputs:
-                busy: list[Any] = []
-                try:
-                    busy.append(idle.get())
-                    while len(busy) < len(inputs) and not idle.empty():
-                        try:
-                            busy.append(idle.get_nowait())
-                        except queue.Empty:  # another thread was quicker
-                            break
-                    for request in busy:
-                        request.start_async([inputs.popleft()], share_inputs=True)
-                    for request in busy:
-                        request.wait()
-                        # Copies: the request's own memory is written again by its next image.
-                        results.append(
-                            {name: np.array(request.get_output_tensor(i).data) for i, name in enumerate(self._outputs)}
-                        )
-                finally:
-                    for request in busy:
-                        with contextlib.suppress(RuntimeError):
-                            request.wait()  # Ctrl-C may have left it running
-                        idle.put(request)
-            return results
-
-        return run_images(batch, self._card, outputs, self.info)
+        results: list[Mapping[str, NDArray[Any]]] = []
+        inputs = collections.deque(prepare_input(image, self.info) for image in batch)
+        while inputs:
+            busy: list[Any] = []
+            try:
+                busy.append(idle.get())
+                while len(busy) < len(inputs) and not idle.empty():
+                    try:
+                        busy.append(idle.get_nowait())
+                    except queue.Empty:  # another thread was quicker
+                        break
+                for request in busy:
+                    request.start_async([inputs.popleft()], share_inputs=True)
+                for request in busy:
+                    request.wait()
+                    # Copies: the request's own memory is written again by its next image.
+                    results.append(
+                        {name: np.array(request.get_output_tensor(i).data) for i, name in enumerate(self._outputs)}
+                    )
+            finally:
+                for request in busy:
+                    with contextlib.suppress(RuntimeError):
+                        request.wait()  # Ctrl-C may have left it running
+                    idle.put(request)
+        return results
 
     @contextlib.contextmanager
     def in_parallel(self) -> Iterator[int]:

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard, parse_json
 from trilitenet.errors import BackendError, WeightsError, import_extra
-from trilitenet.inference.exported import prepare_input, read_metadata, run_images
-from trilitenet.structures import RawOutputs
+from trilitenet.inference.exported import ArtefactBackend, prepare_input, read_metadata
 
 __all__ = ["MAGIC", "TensorRTBackend", "pack_engine", "unpack_engine"]
 
@@ -53,7 +52,7 @@ def unpack_engine(path: Path) -> tuple[ModelCard, ArtefactInfo, bytes]:
     return *read_metadata(header, str(path)), data[start + length :]
 
 
-class TensorRTBackend:  # pragma: no cover - needs a GPU and TensorRT
+class TensorRTBackend(ArtefactBackend):  # pragma: no cover - needs a GPU and TensorRT
     """An artefact of ``trilitenet export --format tensorrt``.
 
     Args:
@@ -85,56 +84,41 @@ class TensorRTBackend:  # pragma: no cover - needs a GPU and TensorRT
             self._context.set_tensor_address(name, self._memory[name])
 
     @property
-    def card(self) -> ModelCard:
-        """What the network is."""
-        return self._card
-
-    @property
     def name(self) -> str:
         """The runtime and the precision."""
         return f"tensorrt cuda {self.info.precision}"
 
-    @property
-    def canvas(self) -> tuple[int, int] | None:
-        """The artefact's input size."""
-        return self.info.size
-
-    def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
-        """Run the network on (B, H, W, 3) uint8 RGB; see `Backend.run`."""
+    def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
         kinds = self._cuda.cudaMemcpyKind
-
-        def outputs() -> list[Mapping[str, NDArray[Any]]]:
-            results: list[Mapping[str, NDArray[Any]]] = []
-            for image in batch:
-                value = prepare_input(image, self.info)
-                self._call(
-                    self._cuda.cudaMemcpyAsync(
-                        self._memory["image"],
-                        value.ctypes.data,
-                        value.nbytes,
-                        kinds.cudaMemcpyHostToDevice,
-                        self._stream,
-                    )
+        results: list[Mapping[str, NDArray[Any]]] = []
+        for image in batch:
+            value = prepare_input(image, self.info)
+            self._call(
+                self._cuda.cudaMemcpyAsync(
+                    self._memory["image"],
+                    value.ctypes.data,
+                    value.nbytes,
+                    kinds.cudaMemcpyHostToDevice,
+                    self._stream,
                 )
-                self._context.execute_async_v3(self._stream)
-                result = {}
-                for name in self._names:
-                    if name != "image":
-                        host = result[name] = np.empty_like(self._host[name])
-                        self._call(
-                            self._cuda.cudaMemcpyAsync(
-                                host.ctypes.data,
-                                self._memory[name],
-                                host.nbytes,
-                                kinds.cudaMemcpyDeviceToHost,
-                                self._stream,
-                            )
+            )
+            self._context.execute_async_v3(self._stream)
+            result = {}
+            for name in self._names:
+                if name != "image":
+                    host = result[name] = np.empty_like(self._host[name])
+                    self._call(
+                        self._cuda.cudaMemcpyAsync(
+                            host.ctypes.data,
+                            self._memory[name],
+                            host.nbytes,
+                            kinds.cudaMemcpyDeviceToHost,
+                            self._stream,
                         )
-                self._call(self._cuda.cudaStreamSynchronize(self._stream))
-                results.append(result)
-            return results
-
-        return run_images(batch, self._card, outputs, self.info)
+                    )
+            self._call(self._cuda.cudaStreamSynchronize(self._stream))
+            results.append(result)
+        return results
 
     def close(self) -> None:
         """Free device memory."""
