@@ -450,7 +450,7 @@ class _Job:
                     writer = stack.enter_context(open_writer(name, self.output, overwrite=self.overwrite))
                     self.writers.append(writer)
                     for source_name in self.names:  # the same names as the overlays, whichever source fails
-                        writer.stem(Perception(size=(1, 1), source=source_name))
+                        writer.stem(source_name)
             columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), _Speed())
             progress = stack.enter_context(show_bars(*columns, TimeRemainingColumn(), quiet=quiet))
             if window is not None:

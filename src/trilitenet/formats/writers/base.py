@@ -167,12 +167,11 @@ class Writer(abc.ABC):
             partial.unlink(missing_ok=True)
             raise
 
-    def stem(self, perception: Perception) -> str:
-        """Return a file name without ending for the perception's source: the same for all frames of a video.
+    def stem(self, source: str | None) -> str:
+        """Return a file name without ending for a perception's source: the same for all frames of a video.
 
         Two sources of the same name are told apart by ``-2``, ``-3`` ...
         """
-        source = perception.source
         if source is None:
             self._unnamed += 1
             return f"image-{self._unnamed:06d}"
@@ -187,7 +186,7 @@ class Writer(abc.ABC):
         A still image keeps its file name (its whole path where another source that `stem` has named so far is called
         the same); a frame of a video gets ``NAME-0000012.jpg``, as the frames of BDD100K's videos are called.
         """
-        stem = self.stem(perception)
+        stem = self.stem(perception.source)
         if perception.frame is not None:
             return f"{stem}-{perception.frame:07d}.jpg"
         if perception.source is None:

@@ -59,7 +59,7 @@ class CvatWriter(Writer):
             return
         if self._video is None or self._video.source != perception.source:
             self._close_video()
-            self._video = _VideoFile(self.create(f"{self.stem(perception)}.cvat-video.xml"), perception)
+            self._video = _VideoFile(self.create(f"{self.stem(perception.source)}.cvat-video.xml"), perception)
         self._video.add(perception, self.tolerance, road)
 
     def _close(self) -> None:

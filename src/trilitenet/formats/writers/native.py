@@ -51,12 +51,12 @@ class JsonWriter(Writer):
         document = to_document(perception, road)
         if perception.frame is None:
             self._close()
-            path = self.create(f"{self.stem(perception)}.json")
+            path = self.create(f"{self.stem(perception.source)}.json")
             self.write_whole(path, f"{dumps(document)}\n")
             return
         if self._video is None or self._source != perception.source:
             self._close()
-            path = self.create(f"{self.stem(perception)}.json")
+            path = self.create(f"{self.stem(perception.source)}.json")
             head = f'{{"schema": "{SCHEMA_VERSION}", "source": {dumps(perception.source)}, "frames": ['
             self._video, self._source = JsonStream(path, head), perception.source
         self._video.add(document)

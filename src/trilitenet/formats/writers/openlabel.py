@@ -47,7 +47,7 @@ class OpenLabelWriter(Writer):
         document = self._document
         if document is None or perception.frame is None or document.source != perception.source:
             self._close()
-            path = self.create(f"{self.stem(perception)}.openlabel.json")
+            path = self.create(f"{self.stem(perception.source)}.openlabel.json")
             self._document = document = _Document(path, perception.source)
         document.add(perception, road)
 

@@ -44,7 +44,7 @@ class ScalabelWriter(Writer):
             "labels": [*self._boxes(perception), *self._masks(perception), *self._lines(road)],
         }
         if perception.frame is not None:
-            frame |= {"videoName": self.stem(perception), "frameIndex": perception.frame}
+            frame |= {"videoName": self.stem(perception.source), "frameIndex": perception.frame}
         if perception.timestamp is not None:
             frame["timestamp"] = round(perception.timestamp * 1000)  # milliseconds
         self._stream.add(frame)

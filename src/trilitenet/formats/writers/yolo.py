@@ -44,7 +44,7 @@ class YoloWriter(Writer):
         if perception.boxes is None:
             return
         number = "" if perception.frame is None else f"-{perception.frame:07d}"
-        path = self.create(f"labels/{self.stem(perception)}{number}.txt")
+        path = self.create(f"labels/{self.stem(perception.source)}{number}.txt")
         lines = []
         height, width = perception.size
         boxes = xyxy_to_cxcywh(perception.boxes.xyxy) / np.array([width, height, width, height], np.float32)
