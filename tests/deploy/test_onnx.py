@@ -11,11 +11,11 @@ from tests.artefacts import SIZE, Artefacts
 from tests.deploy.networks import lively_network
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, Thresholds
 from trilitenet.deploy import onnx as deploy_onnx
-from trilitenet.deploy import quantize
 from trilitenet.deploy.graph import DeployGraph
 from trilitenet.deploy.layouts import LAYOUTS, pick_layout
 from trilitenet.deploy.onnx import PORTABLE_OPERATORS, build_onnx, save_onnx
 from trilitenet.deploy.quantize import KEEP_STEPS, kept_nodes
+from trilitenet.deploy.quiet import quiet
 from trilitenet.deploy.tensorrt import trtexec_line
 from trilitenet.errors import BackendError, ConfigError
 from trilitenet.processing.boxes import cxcywh_to_xyxy
@@ -150,7 +150,7 @@ def test_kept_nodes_follow_modules() -> None:
 
 def test_quantisers_are_quiet_and_others_heard_again(caplog: pytest.LogCaptureFixture) -> None:
     log = logging.getLogger("somebody")
-    with quantize._quiet():
+    with quiet():
         log.warning("of the quantiser")
     log.warning("of others")
     assert caplog.messages == ["of others"]

@@ -10,7 +10,6 @@ import hashlib
 import io
 import json
 import subprocess
-import warnings
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -18,6 +17,7 @@ import torch
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, GRAPH_HASH_KEY, WEIGHTS_HASH_KEY, ArtefactInfo, ModelCard
 from trilitenet.deploy.graph import DeployGraph, Traceable
+from trilitenet.deploy.quiet import quiet
 from trilitenet.errors import BackendError, import_extra, scratch_folder
 
 __all__ = ["NcnnModel", "build_ncnn", "save_ncnn"]
@@ -55,8 +55,7 @@ def build_ncnn(graph: DeployGraph, card: ModelCard, info: ArtefactInfo) -> NcnnM
     traceable = Traceable(graph, card, info)
     with scratch_folder() as folder:
         traced = io.BytesIO()  # PyTorch aborts the process where it cannot write to a file
-        with warnings.catch_warnings(), torch.no_grad():
-            warnings.simplefilter("ignore")  # a trace is what pnnx reads; PyTorch would rather it read something newer
+        with quiet(), torch.no_grad():  # a trace is what pnnx reads; PyTorch would rather it read something newer
             torch.jit.save(torch.jit.trace(traceable, (traceable.image,), check_trace=False), traced)
         (folder / "graph.pt").write_bytes(traced.getbuffer())
         command = [

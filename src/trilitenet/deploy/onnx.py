@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import ast
-import contextlib
-import logging
 import os
 import re
-import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,6 +13,7 @@ import torch
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard, Thresholds
 from trilitenet.deploy.graph import DeployGraph, Traceable
+from trilitenet.deploy.quiet import quiet
 from trilitenet.errors import BackendError, import_extra
 
 __all__ = ["OPSET", "PORTABLE_OPERATORS", "build_onnx", "save_onnx"]
@@ -57,7 +54,7 @@ def build_onnx(
     import_extra("onnxscript", "onnx")
     traceable = Traceable(graph, card, info)
     try:
-        with _quiet():
+        with quiet(), torch.no_grad():
             program = torch.onnx.export(
                 traceable,
                 (traceable.image,),
@@ -99,22 +96,6 @@ def _reason(error: BaseException) -> str:
     """Return what the tracing failed of in one line; the exporter's own words are advice, in colours."""
     text = re.sub(r"\x1b\[[0-9;]*m", "", str(error.__cause__ or error)).strip()
     return text.split("\n", maxsplit=1)[0] or type(error).__name__
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep PyTorch's exporter from talking."""
-    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir", "torch.export")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(None), torch.no_grad():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
 
 
 def _name_nodes(model: Any) -> None:

@@ -12,16 +12,13 @@ nor the parity gate of another processor could have told.
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, Final
 
 from numpy.typing import NDArray
 
+from trilitenet.deploy.quiet import quiet
 from trilitenet.errors import ConfigError, import_extra, scratch_folder
 
 __all__ = ["KEEP_STEPS", "kept_nodes", "quantize_onnx", "quantize_openvino"]
@@ -66,7 +63,7 @@ def quantize_openvino(model: Any, images: Sequence[NDArray[Any]], keep: Sequence
     _check(images)
     nncf = import_extra("nncf", "int8")
     names = [node.get_friendly_name() for node in model.get_ops() if node.get_type_name() != "Constant"]
-    with _quiet():
+    with quiet():
         nncf.set_log_level(logging.ERROR)
         return nncf.quantize(
             model,
@@ -119,7 +116,7 @@ def quantize_onnx(model: Any, images: Sequence[NDArray[Any]], keep: Sequence[str
         def get_next(self) -> Mapping[str, NDArray[Any]] | None:
             return next(self.rest, None)
 
-    with scratch_folder() as folder, _quiet():
+    with scratch_folder() as folder, quiet():
         source, prepared, target = (folder / name for name in ("a.onnx", "b.onnx", "c.onnx"))
         source.write_bytes(model.SerializeToString())
         shape_inference.quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
@@ -145,20 +142,3 @@ def quantize_onnx(model: Any, images: Sequence[NDArray[Any]], keep: Sequence[str
 def _check(images: Sequence[NDArray[Any]]) -> None:
     if not images:
         raise ConfigError("INT8 needs calibration frames; give --calibration with a folder of road frames")
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep the quantisers from talking."""
-    previous = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        with (
-            warnings.catch_warnings(),
-            Path(os.devnull).open("w", encoding="utf-8") as sink,
-            contextlib.redirect_stdout(sink),
-        ):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logging.disable(previous)
