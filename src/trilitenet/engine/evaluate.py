@@ -28,7 +28,7 @@ from trilitenet.config import ModelCard, Task, Thresholds
 from trilitenet.engine.predictions import SavedPredictions
 from trilitenet.engine.provenance import describe_hardware, describe_versions, peak_memory
 from trilitenet.engine.report import SAVED, Provenance, Report
-from trilitenet.engine.scorecard import CONDITIONS, PAPER_THRESHOLDS, Scorecard, protocols_of
+from trilitenet.engine.scorecard import CONDITIONS, PAPER_THRESHOLDS, Scorecard
 from trilitenet.engine.scoring import CanvasPrediction, LabelledImage, add_boxes
 from trilitenet.errors import ConfigError, DataError
 from trilitenet.metrics.detection import DetectionMetric
@@ -146,7 +146,6 @@ def evaluate(
     """
     card = predictor.backend.card
     check_classes(card, dataset)
-    protocols = protocols_of(protocol)
     scorecard = Scorecard(
         card.class_names,
         card.tasks,
@@ -158,12 +157,12 @@ def evaluate(
     )
     started = time.time()
     canvases: dict[tuple[int, int], None] = {}
-    native = "fair" in protocols or on_prediction is not None
+    native = "fair" in scorecard.protocols or on_prediction is not None
 
     def score(sample: LabelledImage, raw: RawOutputs, index: int, letterbox: Letterbox) -> None:
         canvases[letterbox.canvas] = None
         perception, canvas = _predictions(
-            raw, index, letterbox, predictor.thresholds, card, native=native, published="paper" in protocols
+            raw, index, letterbox, predictor.thresholds, card, native=native, published="paper" in scorecard.protocols
         )
         scorecard.add(sample, perception, canvas)
         if on_prediction is not None and perception is not None:
@@ -176,7 +175,7 @@ def evaluate(
         "thresholds": dataclasses.asdict(predictor.thresholds),
         **(about or {}),
     }
-    return _report(scorecard, started, canvases, details, protocols, paper_batch, resamples, seed)
+    return _report(scorecard, started, canvases, details, resamples, seed)
 
 
 def score_predictions(
@@ -217,7 +216,6 @@ def score_predictions(
         ConfigError: If there is no such protocol.
         DataError: If there are no images, predictions are for none of them, or one is broken.
     """
-    protocols = protocols_of(protocol)
     scorecard = Scorecard(
         dataset.class_names,
         predictions.tasks,
@@ -238,8 +236,8 @@ def score_predictions(
         canvases[letterbox.canvas] = None
         scorecard.add(
             sample,
-            perception if "fair" in protocols else None,
-            _saved_on_canvas(perception, letterbox) if "paper" in protocols else None,
+            perception if "fair" in scorecard.protocols else None,
+            _saved_on_canvas(perception, letterbox) if "paper" in scorecard.protocols else None,
         )
         if progress is not None:
             progress(done, count)
@@ -254,7 +252,7 @@ def score_predictions(
         "thresholds": {"confidence": confidence},
         **(about or {}),
     }
-    return _report(scorecard, started, canvases, details, protocols, paper_batch, resamples, seed)
+    return _report(scorecard, started, canvases, details, resamples, seed)
 
 
 def _with_saved(sample: LabelledImage, predictions: SavedPredictions) -> tuple[LabelledImage, Perception]:
@@ -296,8 +294,6 @@ def _report(
     started: float,
     canvases: Iterable[tuple[int, int]],
     about: Mapping[str, Any],
-    protocols: Sequence[str],
-    paper_batch: int,
     resamples: int,
     seed: int,
 ) -> Report:
@@ -308,19 +304,17 @@ def _report(
         started: `time.time` at the start.
         canvases: (height, width) of the network's inputs.
         about: Fields of `Provenance`.
-        protocols: Those that were used.
-        paper_batch: Images a batch of the published averages.
         resamples: Bootstrap draws for the intervals.
         seed: Of the draws.
     """
     settings: dict[str, Any] = {
-        "protocols": list(protocols),
+        "protocols": list(scorecard.protocols),
         "lowest_confidence": LOWEST_CONFIDENCE,
         "resamples": resamples,
         "seed": seed,
     }
-    if "paper" in protocols:
-        settings["paper_batch"] = paper_batch
+    if scorecard.paper is not None:
+        settings["paper_batch"] = scorecard.paper.batch_size
     fields: dict[str, Any] = {
         "model_sha256": None,
         "data": "",

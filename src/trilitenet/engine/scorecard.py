@@ -6,7 +6,7 @@ import collections
 import heapq
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,26 +20,14 @@ from trilitenet.metrics.bootstrap import bootstrap, interval
 from trilitenet.metrics.detection import DetectionMetric
 from trilitenet.structures import Perception
 
-__all__ = ["CONDITIONS", "PAPER_THRESHOLDS", "PROTOCOLS", "Protocol", "Scorecard", "protocols_of"]
+__all__ = ["CONDITIONS", "PAPER_THRESHOLDS", "PROTOCOLS", "Scorecard"]
 
-Protocol = Literal["paper", "fair", "both"]
 PROTOCOLS: Final = ("paper", "fair", "both")
 CONDITIONS: Final = ("timeofday", "weather", "scene")
 """Attributes that tables are made by, in the paper's order."""
 PAPER_THRESHOLDS: Final = Thresholds(confidence=0.001, iou=0.6, max_boxes=300, drivable=0.5, lane=0.5)
 """What the published evaluation decides with."""
 _CURVE_POINTS: Final = 400
-
-
-def protocols_of(protocol: str) -> tuple[str, ...]:
-    """Return the protocols that a choice stands for.
-
-    Raises:
-        ConfigError: If there is no such choice.
-    """
-    if protocol not in PROTOCOLS:
-        raise ConfigError(f"unknown protocol {protocol!r}; known: {', '.join(PROTOCOLS)}")
-    return ("fair", "paper") if protocol == "both" else (protocol,)
 
 
 class Scorecard:
@@ -69,10 +57,14 @@ class Scorecard:
         worst: int = 24,
         by: Sequence[str] = CONDITIONS,
     ) -> None:
-        chosen = protocols_of(protocol)
+        if protocol not in PROTOCOLS:
+            raise ConfigError(f"unknown protocol {protocol!r}; known: {', '.join(PROTOCOLS)}")
+        self.protocols = ("fair", "paper") if protocol == "both" else (protocol,)
         self.tasks = tuple(task for task in TASKS if task in tasks)
-        self.fair = FairMetrics(class_names, self.tasks, confidence=confidence) if "fair" in chosen else None
-        self.paper = PaperMetrics(len(class_names), self.tasks, batch_size=paper_batch) if "paper" in chosen else None
+        self.fair = FairMetrics(class_names, self.tasks, confidence=confidence) if "fair" in self.protocols else None
+        self.paper = None
+        if "paper" in self.protocols:
+            self.paper = PaperMetrics(len(class_names), self.tasks, batch_size=paper_batch)
         self._confidence = confidence
         self._keep = worst
         self._by = tuple(dict.fromkeys(by))
