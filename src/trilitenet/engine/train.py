@@ -515,7 +515,7 @@ class Trainer:
                 "ema": None if self.ema is None else self.ema.state_dict(),
                 "optimiser": self.optimiser.state_dict(),
                 "loss": self.loss.state_dict(),
-                "scaler": self._scaler_state(),
+                "scaler": self.fabric._precision.state_dict(),
                 "best": self.best,
                 "metrics": self.metrics,
                 "stale": self.stale,
@@ -592,10 +592,6 @@ class Trainer:
             value = read_card(path).metrics.get(f"best {name}", -math.inf)
             if value > self.best.get(name, -math.inf):
                 self._ahead[name] = value
-
-    def _scaler_state(self) -> dict[str, Any]:
-        state: dict[str, Any] = self.fabric._precision.state_dict()
-        return state
 
 
 def holds_run(folder: Path) -> bool:
