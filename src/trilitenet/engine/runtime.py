@@ -41,11 +41,9 @@ def pick_precision(precision: str, device: str) -> str:
     """Return a precision of Lightning Fabric: for ``"auto"`` bf16-mixed where the device computes it natively."""
     if precision != "auto":
         return precision
-    if device == "cuda" or (device == "auto" and torch.cuda.is_available()):
+    if device == "cuda":
         return "bf16-mixed" if torch.cuda.is_bf16_supported() else "16-mixed"
-    if device in {"auto", "cpu"} and _has_bf16():
-        return "bf16-mixed"
-    return "32-true"
+    return "bf16-mixed" if device == "cpu" and _has_bf16() else "32-true"
 
 
 def _has_bf16() -> bool:
