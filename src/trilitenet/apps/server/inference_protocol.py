@@ -27,7 +27,7 @@ from trilitenet.apps.server import openapi
 from trilitenet.apps.server.intake import Header, check_header, read_header
 from trilitenet.apps.server.problems import ProblemError
 from trilitenet.apps.server.rest import read_request, until_vanished
-from trilitenet.apps.server.service import Encoded, Outcome, Service, in_time
+from trilitenet.apps.server.service import Encoded, Service, in_time
 from trilitenet.apps.server.settings import BYTES_PER_PIXEL, Settings
 from trilitenet.config import ModelCard
 from trilitenet.structures import Perception
@@ -119,7 +119,7 @@ def protocol_router(service: Service) -> APIRouter:
             count = len(query.images)
             reservation.take(sum(map(_cost, query.images)))
             with service.admit(count - 1) if count > 1 else nullcontext():
-                perceptions = await service.see_all(query.images, deadline, _perception)
+                perceptions = await service.see_all(query.images, deadline, lambda outcome: outcome.perception)
                 return await service.in_pool(_answer, service.name, query, perceptions)
 
         with service.admit(1) as deadline:  # how many images there are is known only when the request is parsed
@@ -130,10 +130,6 @@ def protocol_router(service: Service) -> APIRouter:
 
 def _cost(image: Encoded | NDArray[np.uint8]) -> int:
     return image.header.cost if isinstance(image, Encoded) else image.shape[0] * image.shape[1] * BYTES_PER_PIXEL
-
-
-def _perception(outcome: Outcome) -> Perception:
-    return outcome.perception
 
 
 def _check_model(service: Service, model: str, version: str) -> None:
