@@ -242,22 +242,9 @@ def predict_with(
     quiet: bool = True,
     road: RoadOptions | None = None,
 ) -> PredictReport:
-    """Do what `predict` does, with a predictor at hand.
+    """Do what `predict` does, with a predictor at hand, which is not closed.
 
-    Args:
-        predictor: The predictor; it is not closed.
-        sources: As for `predict`.
-        output: Folder for the results.
-        clip: Which frames of videos are wanted.
-        format: As for `predict`.
-        overlay: As for `predict`.
-        hide: As for `predict`.
-        overwrite: As for `predict`.
-        skip_existing: As for `predict`.
-        rate: As for `predict`.
-        preview: As for `predict`.
-        quiet: As for `predict`.
-        road: What is wanted beyond the single frame.
+    Arguments are as there; ``clip`` says which frames of videos are wanted, ``road`` what is beyond the single frame.
     """
     check_parts(hide, PARTS + ROAD_PARTS)
     job = _Job(
