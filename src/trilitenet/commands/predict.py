@@ -208,11 +208,20 @@ def predict(
         OutputError: If results exist and may not be replaced (told before the work begins), or cannot be written.
     """
     options = RoadOptions(road, camera, track, smoothing)
-    check_parts(hide, PARTS + ROAD_PARTS)
     options.open(still=False)  # what is wrong with them is told before any work
     clip = Clip(every=every, start=start, end=end, max_frames=max_frames)
     job = _Job(
-        sources, output, clip, format, overlay=overlay, overwrite=overwrite, skip_existing=skip_existing, rate=rate
+        sources,
+        output,
+        clip,
+        format,
+        hide=hide,
+        overlay=overlay,
+        overwrite=overwrite,
+        skip_existing=skip_existing,
+        rate=rate,
+        preview=preview,
+        road=options,
     )
     with load(
         model,
@@ -222,7 +231,7 @@ def predict(
         long_side=long_side,
         batch_size=batch_size,
     ) as predictor:
-        return job.run(predictor, hide=hide, preview=preview, quiet=quiet, road=options)
+        return job.run(predictor, quiet=quiet)
 
 
 @text_paths
@@ -246,18 +255,20 @@ def predict_with(
 
     Arguments are as there; ``clip`` says which frames of videos are wanted, ``road`` what is beyond the single frame.
     """
-    check_parts(hide, PARTS + ROAD_PARTS)
     job = _Job(
         sources,
         output,
         clip or Clip(),
         format,
+        hide=hide,
         overlay=overlay,
         overwrite=overwrite,
         skip_existing=skip_existing,
         rate=rate,
+        preview=preview,
+        road=road or RoadOptions(),
     )
-    return job.run(predictor, hide=hide, preview=preview, quiet=quiet, road=road)
+    return job.run(predictor, quiet=quiet)
 
 
 class _Job:
@@ -270,17 +281,24 @@ class _Job:
         clip: Clip,
         formats: Sequence[str],
         *,
+        hide: Sequence[str],
         overlay: bool,
         overwrite: bool,
         skip_existing: bool,
         rate: float,
+        preview: bool,
+        road: RoadOptions,
     ) -> None:
+        check_parts(hide, PARTS + ROAD_PARTS)
         if overwrite and skip_existing:
             raise ConfigError("--skip-existing and --overwrite exclude each other; choose one")
         if not sources:
             raise InputError("no source was given: name a picture, a folder, a video, a URL or a camera's number")
         self.output = output
         self.overlay = overlay
+        self.hide = hide
+        self.preview = preview
+        self.road = road
         self.clip = clip
         self.sources, self.failures = find_sources(sources, clip, rate=rate)
         self.formats = tuple(dict.fromkeys(formats))
@@ -414,18 +432,9 @@ class _Job:
                 files |= {pattern.format(self.stems[each]): each for pattern in patterns for each in _names(source)}
             yield from ((file, f"as {name} of {each}") for file, each in files.items())
 
-    def run(
-        self,
-        predictor: Predictor,
-        *,
-        hide: Sequence[str] = (),
-        preview: bool = False,
-        quiet: bool = False,
-        road: RoadOptions | None = None,
-    ) -> PredictReport:
+    def run(self, predictor: Predictor, *, quiet: bool) -> PredictReport:
         """Do the work."""
-        self.road = road or RoadOptions()
-        window = _Window() if preview else None
+        self.window = _Window() if self.preview else None
         began = time.perf_counter()
         interrupted = False
         with contextlib.ExitStack() as stack:
@@ -440,11 +449,11 @@ class _Job:
                         writer.stem(source_name)
             columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), _Speed())
             progress = stack.enter_context(show_bars(*columns, TimeRemainingColumn(), quiet=quiet))
-            if window is not None:
-                stack.enter_context(contextlib.closing(window))
+            if self.window is not None:
+                stack.enter_context(contextlib.closing(self.window))
             try:
                 for source in self.sources:
-                    self._run_source(source, predictor, progress, hide, window)
+                    self._run_source(source, predictor, progress)
             except _WindowClosed:
                 pass
             except KeyboardInterrupt:
@@ -461,14 +470,7 @@ class _Job:
             skipped=self.skipped,
         )
 
-    def _run_source(
-        self,
-        source: Stills | FrameReader,
-        predictor: Predictor,
-        progress: Progress,
-        hide: Sequence[str],
-        window: _Window | None,
-    ) -> None:
+    def _run_source(self, source: Stills | FrameReader, predictor: Predictor, progress: Progress) -> None:
         name = "images" if isinstance(source, Stills) else PurePath(source.name).name
         total = len(source.paths) if isinstance(source, Stills) else source.expected
         task = progress.add_task(name, total=total)
@@ -500,7 +502,7 @@ class _Job:
                         else:
                             if isinstance(source, FrameReader):
                                 self.unfinished[source.name] = True
-                            self._take(perception, road, video, hide, window)
+                            self._take(perception, road, video)
                     progress.advance(task)
                 if isinstance(source, FrameReader):
                     self.unfinished[source.name] = False
@@ -512,14 +514,7 @@ class _Job:
             self.files.append(video.path)
         progress.update(task, total=progress.tasks[task].completed)
 
-    def _take(
-        self,
-        perception: Perception,
-        road: Road | None,
-        video: VideoWriter | None,
-        hide: Sequence[str],
-        window: _Window | None,
-    ) -> None:
+    def _take(self, perception: Perception, road: Road | None, video: VideoWriter | None) -> None:
         """Write and draw one perception; an interruption waits, so that no result is a frame ahead of another."""
         with uninterrupted():
             for writer in self.writers:
@@ -528,13 +523,13 @@ class _Job:
                 self.images += 1
             else:
                 self.frames += 1
-            if not self.overlay and window is None:
+            if not self.overlay and self.window is None:
                 return
             assert perception.image is not None
             # The frame is ours alone from here on: drawing on it saves a copy.
-            picture = draw(perception, hide=[part for part in hide if part in PARTS], out=perception.image)
+            picture = draw(perception, hide=[part for part in self.hide if part in PARTS], out=perception.image)
             if road is not None:
-                draw_road(picture, perception, road, hide=[part for part in hide if part in ROAD_PARTS])
+                draw_road(picture, perception, road, hide=[part for part in self.hide if part in ROAD_PARTS])
             if video is not None:
                 video.write(picture, perception.timestamp)
             elif self.overlay and perception.frame is None:
@@ -542,8 +537,8 @@ class _Job:
                 path = self.output / f"{self.stems[perception.source]}.jpg"
                 _write_jpeg(path, picture)
                 self.files.append(path)
-        if window is not None:
-            window.show(picture)
+        if self.window is not None:
+            self.window.show(picture)
 
 
 def _follow(perception: Perception, parts: tuple[Steady | None, RoadMonitor | None]) -> tuple[Perception, Road | None]:
