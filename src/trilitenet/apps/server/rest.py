@@ -210,22 +210,19 @@ async def _encoded(request: Request, service: Service, reservation: Reservation,
 def _finisher(output: Format, request: Request, service: Service) -> Callable[[Outcome], Response]:
     """Choose what makes the answer; it runs in a thread."""
     about = _about(request, service)
-    if output == "json":
-        return lambda outcome: Response(
-            _to_json({**about, **_to_mapping(outcome)}),
-            media_type="application/json",
-            headers=_server_timing(outcome),
-        )
-    if output == "masks":
-        return lambda outcome: Response(
-            mask_image(outcome.perception), media_type="image/png", headers=_server_timing(outcome)
-        )
     kind = "PNG" if _accepts_png(request.headers.get("accept", "")) else "JPEG"
-    return lambda outcome: Response(
-        _encode(outcome.perception.draw(outcome.image), kind),
-        media_type=f"image/{kind.lower()}",
-        headers=_server_timing(outcome),
-    )
+
+    def finish(outcome: Outcome) -> Response:
+        if output == "json":
+            content, media_type = _to_json({**about, **_to_mapping(outcome)}), "application/json"
+        elif output == "masks":
+            content, media_type = mask_image(outcome.perception), "image/png"
+        else:
+            content, media_type = _encode(outcome.perception.draw(outcome.image), kind), f"image/{kind.lower()}"
+        stages = ", ".join(f"{stage};dur={value}" for stage, value in outcome.milliseconds.items())
+        return Response(content, media_type=media_type, headers={"server-timing": stages})
+
+    return finish
 
 
 def _accepts_png(accept: str) -> bool:
@@ -247,10 +244,6 @@ def _to_mapping(outcome: Outcome) -> dict[str, Any]:
 
 def _to_json(mapping: dict[str, Any]) -> bytes:
     return json.dumps(mapping, ensure_ascii=False, separators=(",", ":")).encode()
-
-
-def _server_timing(outcome: Outcome) -> dict[str, str]:
-    return {"server-timing": ", ".join(f"{stage};dur={value}" for stage, value in outcome.milliseconds.items())}
 
 
 def mask_image(perception: Perception) -> bytes:
