@@ -49,7 +49,7 @@ class GuardedProtocol(HttpToolsProtocol):
     """
 
     limits = Settings()
-    metrics: Metrics | None = None
+    metrics: Metrics
 
     def __init__(
         self,
@@ -71,8 +71,7 @@ class GuardedProtocol(HttpToolsProtocol):
         """Accept a connection, unless there are too many."""
         super().connection_made(transport)
         if len(self.connections) > 2 * self.limits.max_connections:
-            if self.metrics is not None:
-                self.metrics.reject("too_many_connections")
+            self.metrics.reject("too_many_connections")
             transport.abort()  # too many even of those that are told so
             return
         if len(self.connections) > self.limits.max_connections:
@@ -239,8 +238,7 @@ class GuardedProtocol(HttpToolsProtocol):
             return
         self._cancel()
         self._refused = True
-        if self.metrics is not None:
-            self.metrics.reject(code)
+        self.metrics.reject(code)
         logger.info("connection refused", extra={"status": status, "problem": code})
         if self.cycle is not None and not self.cycle.response_complete:
             if self._in_headers or self.pipeline or self.cycle.response_started:
