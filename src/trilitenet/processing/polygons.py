@@ -1,14 +1,12 @@
-"""A mask as simplified polygons, and back. NumPy and OpenCV only."""
+"""A mask as simplified polygons. NumPy and OpenCV only."""
 
 from __future__ import annotations
-
-from collections.abc import Iterable
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["mask_to_polygons", "polygons_to_mask"]
+__all__ = ["mask_to_polygons"]
 
 
 def mask_to_polygons(
@@ -37,20 +35,3 @@ def mask_to_polygons(
         polygons.append((area, points.astype(np.float32)))
     polygons.sort(key=lambda pair: -pair[0])
     return [points for _, points in polygons]
-
-
-def polygons_to_mask(polygons: Iterable[NDArray[np.float32]], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Fill polygons, their outlines included.
-
-    Args:
-        polygons: (N, 2) x, y of pixel centres each.
-        size: (height, width) of the mask.
-
-    Returns:
-        (height, width) bool.
-    """
-    mask = np.zeros(size, np.uint8)
-    outlines = [np.rint(polygon).astype(np.int32) for polygon in polygons]
-    if outlines:
-        cv2.fillPoly(mask, outlines, 1)
-    return mask.astype(np.bool_)
