@@ -10,7 +10,7 @@ import pytest
 from trilitenet.data.synthetic import Scene
 from trilitenet.errors import ConfigError, OutputError
 from trilitenet.processing.geometry import Camera
-from trilitenet.road.camera import SelfCalibration, View, birds_eye, read_camera, write_camera
+from trilitenet.road.camera import SelfCalibration, View, read_camera, write_camera
 from trilitenet.road.lanes import assign_positions, find_lines
 from trilitenet.road.structures import LaneLine
 
@@ -150,29 +150,6 @@ def test_stays_unsure_without_lanes() -> None:
         SelfCalibration((360, 640), lane_width=0.0)
 
 
-def test_the_picture_from_above_shows_lines_where_they_are(drive: tuple[Scene, ...]) -> None:
-    scene = drive[0]
-    truth = scene.truth
-    view = View(near=6.0, far=24.0, half_width=6.0, scale=20.0)
-    above = birds_eye(truth.paint * np.uint8(255), truth.camera, view)
-    assert above.shape == view.size == (360, 240)
-    solid = [line for line in truth.lines if line.kind == "solid" and 0 < line.d < 6]  # a lorry hides the right one
-    assert solid
-    for line in solid:
-        points = line.points[(line.points[:, 0] > 9) & (line.points[:, 0] < 22)]
-        pixels = np.round(view.to_pixels(points)).astype(int)
-        inside = pixels[(pixels[:, 0] > 2) & (pixels[:, 0] < 237)]
-        hit = [above[v, u - 1 : u + 2].max() > 120 for u, v in inside]
-        assert np.mean(hit) > 0.9
-
-
-def test_the_view_from_above_is_black_behind_the_camera() -> None:
-    camera = dataclasses.replace(CAMERA, distortion=())
-    above = birds_eye(np.full((720, 1280, 3), 255, np.uint8), camera, View(near=-20.0, far=30.0))
-    assert above[: 20 * 8].any()
-    assert not above[31 * 8 :].any()  # from 1 m behind it
-
-
 def test_the_view_goes_there_and_back() -> None:
     view = View()
     points = np.array([[10.0, 2.0], [40.0, -5.0]])
@@ -193,14 +170,3 @@ def test_a_camera_that_looks_to_the_left_is_told_so() -> None:
     assert calibration.camera is not None
     assert calibration.camera.yaw == pytest.approx(0.05, abs=0.01)
     assert calibration.camera.pitch == pytest.approx(0.03, abs=0.01)
-
-
-def test_the_picture_from_above_shows_a_line_across_the_road_straight_though_the_lens_bends_it() -> None:
-    ideal = Camera.from_field_of_view((360, 640), 70.0, 1.4, pitch=0.05)
-    camera = dataclasses.replace(ideal, distortion=(-0.3, 0.1, 0.0, 0.0))
-    points = np.stack([np.full(201, 8.0), np.linspace(-5.0, 5.0, 201)], axis=1)
-    image = np.zeros(camera.size, np.uint8)
-    cv2.polylines(image, [np.round(camera.to_pixels(points)).astype(np.int32)], False, 255, 3)
-    view = View(near=6.0, far=18.0, half_width=6.0, scale=20.0)
-    u, v = np.round(view.to_pixels(points)).astype(int).T
-    assert np.mean(birds_eye(image, camera, view)[v, u] > 120) > 0.95

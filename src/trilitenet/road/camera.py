@@ -1,4 +1,4 @@
-"""Where the camera comes from: a YAML file, or the lanes themselves; and the picture it gives from above."""
+"""Where the camera comes from: a YAML file, or the lanes themselves; and what a picture from above shows."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from trilitenet.processing.geometry import Camera
 from trilitenet.road.lanes import vanishing_point
 from trilitenet.road.structures import LaneLine
 
-__all__ = ["CameraErrors", "SelfCalibration", "View", "birds_eye", "read_camera", "write_camera"]
+__all__ = ["CameraErrors", "SelfCalibration", "View", "read_camera", "write_camera"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -269,29 +268,3 @@ class View:
         u = (self.half_width - points[:, 1]) * self.scale - 0.5
         v = (self.far - points[:, 0]) * self.scale - 0.5
         return np.stack([u, v], axis=1)
-
-
-def birds_eye(image: NDArray[np.uint8], camera: Camera, view: View | None = None) -> NDArray[np.uint8]:
-    """Return the road as seen from above.
-
-    Args:
-        image: (H, W, 3) or (H, W) uint8 of the camera's size, or of another resolution of the same view.
-        camera: The camera.
-        view: What to show.
-
-    Returns:
-        ``view.size`` uint8; black where the camera sees nothing.
-    """
-    view = view or View()
-    size = (image.shape[0], image.shape[1])
-    if size != camera.size:
-        camera = camera.resized(size)
-    if camera.distortion:
-        image = np.asarray(cv2.undistort(image, camera.matrix, np.array(camera.distortion)), np.uint8)
-    matrix = camera.ground_homography @ view.matrix
-    height, width = view.size
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    seen = np.array(cv2.warpPerspective(image, matrix, (width, height), flags=flags), np.uint8)
-    depth = matrix[2, 0] * np.arange(width) + matrix[2, 1] * np.arange(height)[:, None] + matrix[2, 2]
-    seen[depth <= 0] = 0  # behind the camera, where the projection would show the sky upside down
-    return seen

@@ -160,7 +160,7 @@ def _above_matrix(camera: Camera, view: View) -> NDArray[np.float64]:
 def _above_maps(camera: Camera, view: View) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
     """Return where each pixel from above is seen through the lens, as `cv2.remap` takes it.
 
-    Like `birds_eye` it shows what an ideal lens would have in the picture: further out the lens's polynomial may fold.
+    It shows what an ideal lens would have in the picture: further out the lens's polynomial may fold.
     """
     rows, columns = np.indices(view.size).reshape(2, -1)
     ground = (np.stack([columns, rows, np.ones_like(rows)], axis=1) @ view.matrix.T)[:, :2]
