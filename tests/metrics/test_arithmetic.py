@@ -33,5 +33,3 @@ def test_rows_grow_and_are_compact() -> None:
     assert len(rows) == 201
     assert rows.array.dtype == np.int16
     assert rows.array[-1].tolist() == [398, 399]
-    rows.clear()
-    assert len(rows) == 0

@@ -1,1 +1,1 @@
-"""Metrics: update, compute, reset; the published protocol and a fair one, named as such."""
+"""Metrics: update, compute; the published protocol and a fair one, named as such."""

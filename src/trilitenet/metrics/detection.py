@@ -171,10 +171,6 @@ class DetectionMetric:
         self.max_boxes = max_boxes
         self._thresholds = np.array(IOU_THRESHOLDS, np.float64)
         self._ranges = np.array(list(AREAS.values()), np.float64)
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything."""
         areas, classes = len(AREAS), len(self.class_names)
         self._scores = Rows(1, np.float32)
         self._image = Rows(1, np.int32)

@@ -185,10 +185,6 @@ class LaneMetric:
         self.widths = tuple(widths)
         self.tolerances = tuple(tolerances)
         self.tolerance = tolerance
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything."""
         self._pixels = SegmentationMetric()
         self._widths = Rows(4 * len(self.widths))
         # predicted, near a true one, true, near a predicted one: first tolerant pixels, then boundaries a tolerance

@@ -104,10 +104,6 @@ class PublishedSegmentation:
         if batch_size < 1:
             raise ConfigError(f"batch_size must be at least 1, got {batch_size}")
         self.batch_size = batch_size
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything."""
         self._counts = Rows(4)
         self._labelled = Rows(1, np.bool_)
 
@@ -223,10 +219,6 @@ class PublishedDetection:
     def __init__(self, classes: int = 1) -> None:
         self.classes = classes
         self._thresholds = np.array(IOU_THRESHOLDS)
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything."""
         self._scores = Rows(1, np.float32)
         self._image = Rows(1, np.int32)
         self._class = Rows(1, np.int16)

@@ -62,10 +62,6 @@ class Rows:
         little = np.frombuffer(data, self._array.dtype.newbyteorder("<"))
         self.append(little.reshape(-1, self._array.shape[1]))
 
-    def clear(self) -> None:
-        """Drop all rows."""
-        self._used = 0
-
 
 def pack_tables(tables: Mapping[str, Rows]) -> dict[str, str]:
     """Return what `Rows.pack` makes of each table, by name."""

@@ -157,10 +157,6 @@ class SegmentationMetric:
     """Scores of one binary mask, an image at a time; four integers an image are kept."""
 
     def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything."""
         self._counts = Rows(4)
         self._labelled = Rows(1, np.bool_)
 
