@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.errors import ShapeError
-from trilitenet.metrics.arithmetic import box_area, box_cover, box_overlap, mean_known, ratio
+from trilitenet.metrics.arithmetic import box_area, box_cover, box_overlap, mean_known, ratio, weighted_sum
 from trilitenet.metrics.ranking import RankedBoxes, RankedSums
 from trilitenet.metrics.rows import Rows, pack_tables, unpack_tables
 
@@ -268,34 +268,24 @@ class DetectionMetric:
         """Match sorted boxes of one class: (D, areas) bits an IoU threshold of right boxes and of ignored ones."""
         limits = np.minimum(self._thresholds, 1 - 1e-10)
         bits = (1 << np.arange(len(limits))).astype(np.uint16)
-        count, shape = len(boxes), (len(boxes), len(AREAS))
-        matched, passed = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
+        matched = np.zeros((len(boxes), len(AREAS)), np.uint16)
         outside = ~self._in_range(box_area(boxes))  # (areas, D)
         overlap = box_overlap(boxes, truth)
-        cover = box_cover(boxes, regions)
-        in_region = cover.max(axis=1)[:, None] >= limits if len(regions) else np.zeros((count, len(limits)), np.bool_)
-        in_region = in_region | pardoned[:, None]
+        cover = box_cover(boxes, regions).max(axis=1, initial=0)
+        in_region = (cover[:, None] >= limits) | pardoned[:, None]
         # Boxes near no true box: wrong, unless in an ignored region or outside the area range.
-        passed[:] = np.where(
-            outside.T, np.uint16(bits.sum()), (in_region * bits).sum(axis=1).astype(np.uint16)[:, None]
-        )
+        passed = np.where(outside.T, bits.sum(), (in_region * bits).sum(axis=1)[:, None]).astype(np.uint16)
         if not len(truth):
             return matched, passed
         # The others, in falling order of confidence, for all area ranges and thresholds at once.
         true_ignored = ~self._in_range(box_area(truth))  # (areas, G)
         free = np.ones((len(AREAS), len(limits), len(truth)), np.bool_)
-        best_cover = cover.max(axis=1) if len(regions) else np.full(count, -1.0)
         for row in np.flatnonzero(overlap.max(axis=1) >= limits[0]):
             reach = free & (overlap[row] >= limits[:, None])  # (areas, T, G)
-            good = reach & ~true_ignored[:, None, :]
-            hit = good.any(axis=2)
-            score = np.where(good, overlap[row], -1.0)
-            target = score.shape[2] - 1 - score[..., ::-1].argmax(axis=2)  # of equal ones the last, as in COCO
-            spare = reach & true_ignored[:, None, :]
-            spare_score = np.where(spare, overlap[row], -1.0)
-            spare_target = spare_score.shape[2] - 1 - spare_score[..., ::-1].argmax(axis=2)
-            spare_best = spare_score.max(axis=2)
-            in_spare = ~hit & spare.any(axis=2) & (spare_best > best_cover[row] * in_region[row])
+            best, target = _last_best(np.where(reach & ~true_ignored[:, None, :], overlap[row], 0.0))
+            spare_best, spare_target = _last_best(np.where(reach & true_ignored[:, None, :], overlap[row], 0.0))
+            hit = best > 0
+            in_spare = ~hit & (spare_best > cover[row] * in_region[row])
             area, level = np.nonzero(hit)
             free[area, level, target[hit]] = False
             area, level = np.nonzero(in_spare)
@@ -330,10 +320,6 @@ class DetectionMetric:
 
     # Scores -------------------------------------------------------------------------------------------------------
 
-    def _objects_of(self, number: int, area: int, weights: NDArray[Any] | None) -> FloatArray:
-        column = self._objects.array[:, number * len(AREAS) + area].astype(np.float64)
-        return np.array([column.sum()]) if weights is None else np.asarray(weights, np.float64) @ column
-
     def average_precision(self, weights: NDArray[Any] | None = None, area: str = "all") -> FloatArray:
         """Return AP by class and IoU threshold.
 
@@ -344,12 +330,11 @@ class DetectionMetric:
         Returns:
             (R, classes, thresholds) in [0, 1], NaN for a class without true boxes.
         """
-        rounds = 1 if weights is None else len(weights)
-        out = np.full((rounds, len(self.class_names), len(IOU_THRESHOLDS)), np.nan)
         column = list(AREAS).index(area)
-        for number in range(len(self.class_names)):
+        totals = weighted_sum(self._objects.array[:, column :: len(AREAS)], weights)  # (R, classes)
+        out = np.full((*totals.shape, len(IOU_THRESHOLDS)), np.nan)
+        for number, objects in enumerate(totals.T):
             ranked = self._ranking(number, column)
-            objects = self._objects_of(number, column, weights)
             for sums in ranked.sums(weights, len(self)):
                 for level in range(len(IOU_THRESHOLDS)):
                     bit = np.uint16(1 << level)
@@ -411,9 +396,8 @@ class DetectionMetric:
                 self._objects.array[:, :: len(AREAS)].sum(axis=1),
             ],
             axis=1,
-        ).astype(np.float64)
-        sums = table.sum(axis=0)[None] if weights is None else np.asarray(weights, np.float64) @ table
-        right, bad, objects = sums.T
+        )
+        right, bad, objects = weighted_sum(table, weights).T
         return {
             "precision": ratio(right, right + bad),
             "recall": ratio(right, objects),
@@ -528,6 +512,11 @@ def in_regions(boxes: NDArray[Any], regions: NDArray[Any]) -> NDArray[np.bool_]:
     """Return which (D, 4) boxes lie by half or more in one of (M, 4) ignored regions."""
     cover = box_cover(np.asarray(boxes, np.float64), np.asarray(regions, np.float64).reshape(-1, 4))
     return np.asarray(np.max(cover, axis=1, initial=0) >= 0.5)
+
+
+def _last_best(overlap: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
+    """Return the largest overlap along the last axis and where it is: of equal ones the last, as in COCO."""
+    return overlap.max(axis=-1), overlap.shape[-1] - 1 - overlap[..., ::-1].argmax(axis=-1)
 
 
 def _ap(sums: RankedSums, hit: NDArray[np.bool_], counted: NDArray[np.bool_], objects: FloatArray) -> FloatArray:

@@ -252,14 +252,8 @@ class LaneMetric:
         Returns:
             Name -> (R,).
         """
-        pixels = self._pixels.figures(weights)
-        figures = {
-            "iou": pixels["iou"],
-            "precision": pixels["precision"],
-            "recall": pixels["recall"],
-            "f1": pixels["f1"],
-            "balanced_accuracy": pixels["balanced_accuracy"],
-        }
+        figures = self._pixels.figures(weights)
+        del figures["miou"]
         widths = weighted_sum(self._widths.array, weights)
         for index, width in enumerate(self.widths):
             tp, fp, fn, _ = widths[:, 4 * index : 4 * index + 4].T
