@@ -29,6 +29,7 @@ from trilitenet.data.rasterise import flatten
 from trilitenet.data.reading import IMAGE_ENDINGS, is_crowd
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel, same_name
 from trilitenet.errors import DataError, brief
+from trilitenet.formats.readers.mapping import Labels
 
 __all__ = ["BDD100K_SPLITS", "BddSource", "parse_labels", "read_bdd100k"]
 
@@ -203,25 +204,14 @@ def parse_labels(content: Any, image: Path, source: str, tasks: Collection[Task]
         raise DataError(f"{source}: an image's entry must be an object, got {type(content).__name__}")
     if content.get("frames") is None and not {"labels", "name"} & content.keys():
         raise DataError(f"{source}: neither 'frames' (2018, one file an image) nor 'labels' (Scalabel) in the entry")
-    objects: list[ObjectLabel] = []
-    areas: list[AreaLabel] = []
-    lanes: list[LaneLabel] = []
-    dropped: Counter[str] = Counter()
+    labels = Labels()
     try:
         for item in _items(content):
-            _parse_item(item, objects, areas, lanes, dropped)
-        attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
+            _parse_item(item, labels)
+        labels.attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise DataError(f"{source}: {image.stem}: {brief(error)} is not as BDD100K has it") from error
-    return ImageRecord(
-        name=image.stem,
-        image=image,
-        objects=tuple(objects) if "detection" in tasks else None,
-        drivable=tuple(areas) if "drivable" in tasks else None,
-        lane=tuple(lanes) if "lane" in tasks else None,
-        attributes=attributes,
-        dropped=dict(dropped),
-    )
+    return labels.record(image.stem, image, tasks)
 
 
 def _items(content: Mapping[str, Any]) -> list[Any]:
@@ -232,13 +222,7 @@ def _items(content: Mapping[str, Any]) -> list[Any]:
     return [*(content.get("labels") or ())]
 
 
-def _parse_item(
-    item: dict[str, Any],
-    objects: list[ObjectLabel],
-    areas: list[AreaLabel],
-    lanes: list[LaneLabel],
-    dropped: Counter[str],
-) -> None:
+def _parse_item(item: dict[str, Any], labels: Labels) -> None:
     category = str(item["category"])
     attributes = item.get("attributes") or {}
     if item.get("box2d") is not None:
@@ -246,22 +230,22 @@ def _parse_item(
         corners = (float(box["x1"]), float(box["y1"]), float(box["x2"]), float(box["y2"]))
         crowd = is_crowd(item) or is_crowd({"attributes": {"crowd": attributes.get("ignored")}})
         kept = {str(k): v for k, v in attributes.items() if isinstance(v, (str, bool, int, float))}
-        objects.append(ObjectLabel(category, corners, crowd, kept))
+        labels.objects.append(ObjectLabel(category, corners, crowd, kept))
     elif item.get("poly2d"):
         kind = _area_kind(category, attributes)
         if kind is None and not _is_lane(category):
-            dropped[f"polygon of category {category!r}"] += 1
+            labels.dropped[f"polygon of category {category!r}"] += 1
             return
         for vertices, types, closed in _polygons(item["poly2d"], closed=kind is not None):
             if len(vertices) < (3 if closed else 2):
-                dropped[f"{'area' if kind else 'lane'} with too few points"] += 1
+                labels.dropped[f"{'area' if kind else 'lane'} with too few points"] += 1
                 continue
             points = flatten(vertices, types, closed=closed)
             if kind is not None:
-                areas.append(AreaLabel(kind, points))
+                labels.areas.append(AreaLabel(kind, points))
                 continue
             lane_type = str(attributes.get("laneType") or attributes.get("laneTypes") or category.removeprefix("lane/"))
-            lanes.append(
+            labels.lanes.append(
                 LaneLabel(
                     category=lane_type if category == "lane" or category.startswith("lane/") else category,
                     points=points,
@@ -272,7 +256,7 @@ def _parse_item(
                 )
             )
     else:
-        dropped[f"label without shape of category {category!r}"] += 1
+        labels.dropped[f"label without shape of category {category!r}"] += 1
 
 
 def _area_kind(category: str, attributes: Mapping[str, Any]) -> str | None:

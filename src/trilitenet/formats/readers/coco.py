@@ -8,7 +8,7 @@ Format: https://cocodataset.org/#format-data. Found are ``annotations/*_{split}*
 from __future__ import annotations
 
 import re
-from collections import Counter, defaultdict
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from trilitenet.data.records import (
     named_apart,
 )
 from trilitenet.errors import DataError, brief
-from trilitenet.formats.readers.mapping import SPLIT_NAMES, LabelMapping, Shapes, find_image, read_json
+from trilitenet.formats.readers.mapping import SPLIT_NAMES, LabelMapping, Labels, find_image, read_json
 
 __all__ = ["read_coco"]
 
@@ -144,23 +144,13 @@ def _read_file(
                 continue
             size = (int(image["height"]), int(image["width"]))
             try:
-                objects, shapes, dropped = _read_labels(labels[image["id"]], names, mapping)
+                own = _read_labels(labels[image["id"]], names, mapping)
             except DataError as error:
                 reason = f"{path}: image {image['file_name']!r}, {error}"
                 records.append(BrokenRecord(place.stem, place, reason=reason))
                 continue
-            records.append(
-                ImageRecord(
-                    name=place.stem,
-                    image=place,
-                    objects=tuple(objects) if "detection" in tasks else None,
-                    drivable=tuple(shapes.areas) if "drivable" in tasks else None,
-                    lane=tuple(shapes.lanes) if "lane" in tasks else None,
-                    attributes={str(key): str(value) for key, value in (image.get("attributes") or {}).items()},
-                    dropped=dict(dropped),
-                    size=size if all(size) else None,
-                )
-            )
+            own.attributes = {str(key): str(value) for key, value in (image.get("attributes") or {}).items()}
+            records.append(own.record(place.stem, place, tasks, size))
     except DataError:
         raise
     except (LookupError, TypeError, ValueError, OverflowError, AttributeError) as error:
@@ -168,28 +158,17 @@ def _read_file(
     return records, missing, strays
 
 
-def _read_labels(
-    items: list[dict[str, Any]], names: dict[Any, str], mapping: LabelMapping
-) -> tuple[list[ObjectLabel], Shapes, Counter[str]]:
-    objects: list[ObjectLabel] = []
-    shapes = Shapes()
-    dropped: Counter[str] = Counter()
+def _read_labels(items: list[dict[str, Any]], names: dict[Any, str], mapping: LabelMapping) -> Labels:
+    labels = Labels()
     for item in items:
         try:
-            _read_label(item, names, mapping, objects, shapes, dropped)
+            _read_label(item, names, mapping, labels)
         except DataError as error:
             raise DataError(f"annotation {item.get('id', '')!r}: {error}") from error
-    return objects, shapes, dropped
+    return labels
 
 
-def _read_label(
-    item: dict[str, Any],
-    names: dict[Any, str],
-    mapping: LabelMapping,
-    objects: list[ObjectLabel],
-    shapes: Shapes,
-    dropped: Counter[str],
-) -> None:
+def _read_label(item: dict[str, Any], names: dict[Any, str], mapping: LabelMapping, labels: Labels) -> None:
     number = item.get("category_id")
     if not isinstance(number, (int, float, str)):
         raise DataError("category_id must be the id of a category")
@@ -197,20 +176,21 @@ def _read_label(
     kind = mapping.area_kind(category)
     segmentation = item.get("segmentation")
     if category not in mapping.lane and kind in {None, "ignore"}:
-        objects.append(ObjectLabel(category, _box(item.get("bbox")), bool(item.get("iscrowd")) or kind == "ignore"))
+        crowd = bool(item.get("iscrowd")) or kind == "ignore"
+        labels.objects.append(ObjectLabel(category, _box(item.get("bbox")), crowd))
         if kind is None or not segmentation:
             return
     if not segmentation:
-        dropped[f"{category}: without a segmentation"] += 1
+        labels.dropped[f"{category}: without a segmentation"] += 1
     elif isinstance(segmentation, dict):
         runs = _runs(segmentation, kind or "direct")
-        (shapes.lanes if category in mapping.lane else shapes.areas).append(runs)
+        (labels.lanes if category in mapping.lane else labels.areas).append(runs)
     elif isinstance(segmentation, list):
         for points in map(_points, segmentation):
             if category in mapping.lane:
-                shapes.lanes.append(LaneLabel(category, points, closed=True))
+                labels.lanes.append(LaneLabel(category, points, closed=True))
             else:
-                shapes.areas.append(AreaLabel(kind or "direct", points))
+                labels.areas.append(AreaLabel(kind or "direct", points))
     else:
         raise DataError("segmentation must be a list of polygons, or run lengths")
 

@@ -7,7 +7,7 @@ attributes of an image's tags become the image's.
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
+from collections import defaultdict
 from pathlib import Path
 from typing import Final
 from xml.etree import ElementTree
@@ -26,7 +26,7 @@ from trilitenet.data.records import (
     named_apart,
 )
 from trilitenet.errors import DataError, brief
-from trilitenet.formats.readers.mapping import SPLIT_NAMES, LabelMapping, Shapes, find_image, hull
+from trilitenet.formats.readers.mapping import SPLIT_NAMES, LabelMapping, Labels, find_image, hull
 
 __all__ = ["read_cvat"]
 
@@ -116,80 +116,57 @@ def _read_file(
             missing += 1
             continue
         try:
-            objects, shapes, attributes, dropped = _read_image(element, mapping)
+            labels = _read_image(element, mapping)
             size = (int(element.get("height") or 0), int(element.get("width") or 0))
         except (KeyError, ValueError) as error:
             what = str(error) if isinstance(error, DataError) else f"not as CVAT has it ({brief(error)})"
             records[split].append(BrokenRecord(place.stem, place, reason=f"{path}: image {name!r}, {what}"))
             continue
-        records[split].append(
-            ImageRecord(
-                name=place.stem,
-                image=place,
-                objects=tuple(objects) if "detection" in tasks else None,
-                drivable=tuple(shapes.areas) if "drivable" in tasks else None,
-                lane=tuple(shapes.lanes) if "lane" in tasks else None,
-                attributes=attributes,
-                dropped=dict(dropped),
-                size=size if all(size) else None,
-            )
-        )
+        records[split].append(labels.record(place.stem, place, tasks, size))
     return missing
 
 
-def _read_image(
-    element: ElementTree.Element, mapping: LabelMapping
-) -> tuple[list[ObjectLabel], Shapes, dict[str, str], Counter[str]]:
-    objects: list[ObjectLabel] = []
-    shapes = Shapes()
-    attributes: dict[str, str] = {}
-    dropped: Counter[str] = Counter()
+def _read_image(element: ElementTree.Element, mapping: LabelMapping) -> Labels:
+    labels = Labels()
     for shape in sorted(element, key=lambda item: int(item.get("z_order") or 0)):
         try:
-            _read_shape(shape, mapping, objects, shapes, attributes, dropped)
+            _read_shape(shape, mapping, labels)
         except (KeyError, ValueError) as error:
             raise DataError(f"{shape.tag} of label {shape.get('label', '')!r}: {_NEEDED[shape.tag]}") from error
-    return objects, shapes, attributes, dropped
+    return labels
 
 
-def _read_shape(
-    shape: ElementTree.Element,
-    mapping: LabelMapping,
-    objects: list[ObjectLabel],
-    shapes: Shapes,
-    attributes: dict[str, str],
-    dropped: Counter[str],
-) -> None:
+def _read_shape(shape: ElementTree.Element, mapping: LabelMapping, labels: Labels) -> None:
     label = shape.get("label", "")
     own = {item.get("name", ""): item.text or "" for item in shape.findall("attribute")}
     kind = mapping.area_kind(label)
     if shape.tag == "tag":
-        attributes |= own
+        labels.attributes |= own
     elif shape.tag == "box":
         # Text, of which "false" would be true.
         crowd = own.pop("crowd", "").strip().lower() == "true"
         more: dict[str, str | bool | float] = {**own, "crowd": crowd, "occluded": shape.get("occluded") == "1"}
-        objects.append(ObjectLabel(label, _box(shape), crowd, more))
+        labels.objects.append(ObjectLabel(label, _box(shape), crowd, more))
     elif shape.tag in {"polygon", "polyline"}:
         points = _points(shape.attrib["points"])
         closed = shape.tag == "polygon"
         if label in mapping.lane:
-            shapes.lanes.append(LaneLabel(label, points, closed=closed, edge=mapping.lane_edges and not closed))
+            labels.lanes.append(LaneLabel(label, points, closed=closed, edge=mapping.lane_edges and not closed))
         elif closed:
-            objects += shapes.add(AreaLabel(kind or "direct", points), ObjectLabel(label, hull(points)), kind)
+            labels.add(AreaLabel(kind or "direct", points), ObjectLabel(label, hull(points)), kind)
         else:
-            objects.append(ObjectLabel(label, hull(points), crowd=kind == "ignore"))
+            labels.objects.append(ObjectLabel(label, hull(points), crowd=kind == "ignore"))
     elif shape.tag == "mask":
         left, top, width, height = (int(shape.attrib[key]) for key in ("left", "top", "width", "height"))
         lengths = tuple(int(run) for run in shape.attrib["rle"].split(","))
         runs = RowRuns(kind or "direct", left, top, width, height, lengths)
         if label in mapping.lane:
-            shapes.lanes.append(runs)
+            labels.lanes.append(runs)
         else:
             corners = (float(left), float(top), float(left + width), float(top + height))
-            objects += shapes.add(runs, ObjectLabel(label, corners), kind)
+            labels.add(runs, ObjectLabel(label, corners), kind)
     elif shape.tag in _SHAPES:
-        dropped[f"shape of kind {shape.tag!r}"] += 1
+        labels.dropped[f"shape of kind {shape.tag!r}"] += 1
 
 
 def _box(shape: ElementTree.Element) -> tuple[float, float, float, float]:

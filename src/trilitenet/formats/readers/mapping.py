@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import re
+from collections import Counter
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -13,7 +15,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import Task, check_tasks, parse, parse_json, read_yaml
 from trilitenet.data.description import VEHICLES
-from trilitenet.data.records import AreaLabel, LaneLabel, ObjectLabel, RunLabel
+from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ObjectLabel, RunLabel
 from trilitenet.errors import ConfigError, DataError, brief
 
 __all__ = ["SPLIT_NAMES", "LabelMapping", "MaskRule", "parse_colour", "read_mapping"]
@@ -155,14 +157,17 @@ class LabelMapping:
 
 
 @dataclasses.dataclass
-class Shapes:
-    """Gathers the areas and markings of one image while a reader goes through it."""
+class Labels:
+    """Gathers the labels of one image while a reader goes through it."""
 
+    objects: list[ObjectLabel] = dataclasses.field(default_factory=list)
     areas: list[AreaLabel | RunLabel] = dataclasses.field(default_factory=list)
     lanes: list[LaneLabel | RunLabel] = dataclasses.field(default_factory=list)
+    attributes: dict[str, str] = dataclasses.field(default_factory=dict)
+    dropped: Counter[str] = dataclasses.field(default_factory=Counter)
 
-    def add(self, region: AreaLabel | RunLabel, label: ObjectLabel, kind: str | None) -> list[ObjectLabel]:
-        """Take a region that is no marking; return it as an object too, unless it is an area alone.
+    def add(self, region: AreaLabel | RunLabel, label: ObjectLabel, kind: str | None) -> None:
+        """Take a region that is no marking, as an object too unless it is an area alone.
 
         Args:
             region: As an area.
@@ -171,7 +176,21 @@ class Shapes:
         """
         if kind is not None:
             self.areas.append(region)
-        return [dataclasses.replace(label, crowd=kind == "ignore")] if kind in {None, "ignore"} else []
+        if kind in {None, "ignore"}:
+            self.objects.append(dataclasses.replace(label, crowd=kind == "ignore"))
+
+    def record(self, name: str, image: Path, tasks: Collection[Task], size: tuple[int, int] = (0, 0)) -> ImageRecord:
+        """Return the labels of the tasks that are labelled; ``size`` is that of `ImageRecord`, with 0 for unknown."""
+        return ImageRecord(
+            name=name,
+            image=image,
+            objects=tuple(self.objects) if "detection" in tasks else None,
+            drivable=tuple(self.areas) if "drivable" in tasks else None,
+            lane=tuple(self.lanes) if "lane" in tasks else None,
+            attributes=self.attributes,
+            dropped=dict(self.dropped),
+            size=size if all(size) else None,
+        )
 
 
 def read_mapping(path: str | Path | None) -> LabelMapping:

@@ -16,7 +16,7 @@ from trilitenet.config import Task, read_yaml
 from trilitenet.data.reading import IMAGE_ENDINGS
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ObjectLabel, image_size, name_apart, same_name
 from trilitenet.errors import ConfigError, DataError, brief
-from trilitenet.formats.readers.mapping import LabelMapping, Shapes, hull
+from trilitenet.formats.readers.mapping import LabelMapping, Labels, hull
 
 __all__ = ["YoloSource", "read_yolo"]
 
@@ -66,18 +66,10 @@ class YoloSource:
         if not path.is_file() and self._mapping.missing == "unlabelled":
             return ImageRecord(name, image)
         text = _read_text(path) if path.is_file() else ""
-        objects, shapes = self._parse(text, path, image)
-        return ImageRecord(
-            name=name,
-            image=image,
-            objects=tuple(objects) if "detection" in self._tasks else None,
-            drivable=tuple(shapes.areas) if "drivable" in self._tasks else None,
-            lane=tuple(shapes.lanes) if "lane" in self._tasks else None,
-        )
+        return self._parse(text, path, image).record(name, image, self._tasks)
 
-    def _parse(self, text: str, path: Path, image: Path) -> tuple[list[ObjectLabel], Shapes]:
-        objects: list[ObjectLabel] = []
-        shapes = Shapes()
+    def _parse(self, text: str, path: Path, image: Path) -> Labels:
+        labels = Labels()
         lines = [(number, line.split()) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
         size = image_size(image) if lines else (0, 0)
         scale = np.array([size[1], size[0]], np.float64)
@@ -97,17 +89,17 @@ class YoloSource:
             if len(values) in (4, 5):
                 centre, extent = values[:2] * scale, values[2:4] * scale
                 x1, y1, x2, y2 = (float(v) for v in (*(centre - extent / 2), *(centre + extent / 2)))
-                objects.append(ObjectLabel(category, (x1, y1, x2, y2)))
+                labels.objects.append(ObjectLabel(category, (x1, y1, x2, y2)))
                 continue
             if len(values) < 6 or len(values) % 2:
                 raise DataError(f"{path}, line {number}: neither a box (4 numbers) nor a polygon (6 or more, even)")
             points = values.reshape(-1, 2) * scale
             kind = self._mapping.area_kind(category)
             if category in self._mapping.lane:
-                shapes.lanes.append(LaneLabel(category, points, closed=True))
+                labels.lanes.append(LaneLabel(category, points, closed=True))
             else:
-                objects += shapes.add(AreaLabel(kind or "direct", points), ObjectLabel(category, hull(points)), kind)
-        return objects, shapes
+                labels.add(AreaLabel(kind or "direct", points), ObjectLabel(category, hull(points)), kind)
+        return labels
 
 
 def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSource:
