@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import logging
 import os
 import sys
@@ -274,8 +275,13 @@ def test_damaged_shards_are_named_and_made_anew(root: Path, tmp_path: Path) -> N
     for path, content, message in (
         (shard, whole[shard][: len(whole[shard]) // 2], r"train-000001\.tar: is cut short; prepare the data set again"),
         (index, whole[index][:-9], r"train-000001\.index\.jsonl: is damaged; prepare the data set again"),
-        (index, b"[]\n" + whole[index], r"train-000001\.index\.jsonl: is damaged; prepare the data set again"),
+        (
+            index,
+            b"[]\n" + whole[index].partition(b"\n")[2],
+            r"train-000001\.index\.jsonl: is damaged; prepare the data set again",
+        ),
         (index, b"", r"train-000001\.index\.jsonl: is empty; prepare the data set again"),
+        (index, whole[index].partition(b"\n")[2], "out: the index of train holds 10 images, not 11; prepare the data"),
     ):
         path.write_bytes(content)
         with pytest.raises(DataError, match=message):
@@ -289,6 +295,17 @@ def test_damaged_shards_are_named_and_made_anew(root: Path, tmp_path: Path) -> N
             DataError, match=rf"prepared\.json: {message}.*; remove .*out and prepare the data set again"
         ):
             read()
+
+
+def test_a_data_set_prepared_without_counts_is_read(root: Path, tmp_path: Path) -> None:
+    prepare(root, tmp_path / "out", canvas=CANVAS, splits=["val"])
+    path = tmp_path / "out/prepared.json"
+    state = json.loads(path.read_text())
+    assert state.pop("counts") == {"val": 3}
+    path.write_text(json.dumps(state))
+    assert len(PreparedDataset(tmp_path / "out", "val")) == 3
+    prepare(root, tmp_path / "out", canvas=CANVAS, splits=["train"])
+    assert json.loads(path.read_text())["counts"] == {"train": 11}
 
 
 def test_a_split_without_images_is_left_out(root: Path, tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Data sets at training resolution, packed into WebDataset shards: written once, read back fast and in any order.
 
-    OUT/prepared.json                 canvas, classes, how images are stored
+    OUT/prepared.json                 canvas, classes, how images are stored, shards and images a split
     OUT/{split}-000000.tar            per image NAME.jpg (or NAME.image.npy), NAME.drivable.npy, NAME.lane.npy,
                                       NAME.valid.npy, NAME.drivable_valid.npy, NAME.lane_valid.npy (where there are
                                       such masks) and NAME.json
@@ -293,6 +293,11 @@ class PreparedDataset:
                 raise DataError(f"{_index_name(shard)}: is empty; prepare the data set again")
             self._lines += lines
             self._shard_of += [number] * len(lines)
+        prepared = state["counts"].get(split, len(self))
+        if len(self) != prepared:
+            raise DataError(
+                f"{root}: the index of {split} holds {len(self)} images, not {prepared}; prepare the data set again"
+            )
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -584,7 +589,7 @@ def _open_out(plan: _Plan) -> None:
     for part in plan.out.glob(".*.part"):  # of a run that was killed
         part.unlink()
     if not state.is_file():
-        _replace_state(plan, {}, {})
+        _replace_state(plan, {"splits": {}, "shards": {}, "counts": {}})
 
 
 def _forget(plan: _Plan, splits: Iterable[str]) -> None:
@@ -593,14 +598,14 @@ def _forget(plan: _Plan, splits: Iterable[str]) -> None:
     for split in splits:
         there["splits"].pop(split, None)
         there["shards"].pop(split, None)
-    _replace_state(plan, there["splits"], there["shards"])
+    _replace_state(plan, there)
 
 
 def _write_state(plan: _Plan, datasets: Mapping[str, SampleSource]) -> None:
     there = _read_state(plan.out)
-    splits, shards = dict(there["splits"]), dict(there["shards"])
     for split, dataset in datasets.items():
-        splits[split] = _fingerprint(plan.root, split)
+        there["splits"][split] = _fingerprint(plan.root, split)
+        there["counts"][split] = len(dataset)
         shard_name = re.compile(re.escape(split) + r"-\d{6,}\.tar")
         found = sorted(path.name for path in plan.out.iterdir() if shard_name.fullmatch(path.name))
         kept, count = [], 0
@@ -611,12 +616,12 @@ def _write_state(plan: _Plan, datasets: Mapping[str, SampleSource]) -> None:
             else:  # of an earlier, larger data set
                 (plan.out / name).unlink()
                 (plan.out / _index_name(name)).unlink(missing_ok=True)
-        shards[split] = kept
-    _replace_state(plan, splits, shards)
+        there["shards"][split] = kept
+    _replace_state(plan, there)
 
 
-def _replace_state(plan: _Plan, splits: Mapping[str, Any], shards: Mapping[str, Any]) -> None:
-    text = json.dumps({**_settings(plan), "splits": splits, "shards": shards}, indent=1, sort_keys=True)
+def _replace_state(plan: _Plan, state: Mapping[str, Any]) -> None:
+    text = json.dumps({**state, **_settings(plan)}, indent=1, sort_keys=True)
     with replacing(plan.out / PREPARED_FILE) as part:
         part.write_text(text, encoding="utf-8")
 
@@ -633,7 +638,7 @@ def _read_state(folder: Path) -> dict[str, Any]:
         raise DataError(f"{path}: format {found!r}, not {FORMAT}; {cure}")
     if missing := {"canvas", "class_names", "mask_above", "splits", "shards"} - state.keys():
         raise DataError(f"{path}: lacks {', '.join(sorted(missing))}; {cure}")
-    return dict(state)
+    return {"counts": {}, **state}  # which earlier versions did not write
 
 
 def _files_of(root: Path, split: str) -> Iterator[str]:
