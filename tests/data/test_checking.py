@@ -308,6 +308,8 @@ def test_copies_are_found_among_many_pictures_of_one_hash() -> None:
 def test_labels_of_tasks_that_are_not_labelled_at_all_do_not_count(root: Path) -> None:
     (root / "dataset.yaml").write_text("tasks: [lane]\n")
     truncate(root / "da_seg_annotations/train/train_0001.png")
+    annotate(root, box(1, 2, 30, 40, "unicorn"), box(1, 2, 30, 40, "unicorn"), {"category": "car", "box2d": {"x1": 3}})
+    assert DrivingDataset(root, "train")[0].boxes is None
     report = check_dataset(root)
     assert report.labelled["train"] == {"lane": 24}
     assert report.drivable == {}

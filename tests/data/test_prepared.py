@@ -73,10 +73,15 @@ def test_attributes_tasks_and_missing_labels(root: Path, tmp_path: Path) -> None
         one, two = raw[index], packed[index]
         for field in ("boxes", "class_id", "drivable", "lane", *VALID):
             assert (getattr(one, field) is None) == (getattr(two, field) is None), field
-    lanes = PreparedDataset(tmp_path / "out", "train", tasks=["lane"])[0]
-    assert lanes.boxes is None
-    assert lanes.drivable is None
-    assert lanes.lane is not None
+    assert any(len(sample.ignored) for sample in packed)
+    for lanes in (
+        PreparedDataset(tmp_path / "out", "train", tasks=["lane"]),
+        DrivingDataset(root, "train", tasks=["lane"]),
+    ):
+        assert lanes[0].boxes is None
+        assert lanes[0].drivable is None
+        assert lanes[0].lane is not None
+        assert not any(len(sample.ignored) for sample in lanes)
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # webdataset leaves files open

@@ -362,10 +362,9 @@ def _look(job: _Job, split: str, file: str) -> _Facts:
         if not label.is_file():
             continue
         if task == "detection":
-            found, found_sizes, attributes = _look_at_boxes(job, label, size, faults)
+            objects, box_sizes, attributes = _look_at_boxes(job, label, size, faults)
             if task in tasks:
                 labelled.append(task)
-                objects, box_sizes = found, found_sizes
         elif task in tasks:
             labelled.append(task)
             meaning = job.description.drivable if task == "drivable" else job.description.lane
@@ -430,6 +429,8 @@ def _look_at_boxes(
     counts: Counter[str] = Counter()
     seen: set[tuple[str, float, float, float, float]] = set()
     sizes: list[tuple[float, float]] = []
+    if "detection" not in job.description.tasks:
+        labels = []
     for number, (category, box, crowd) in enumerate(labels):
         if box is None:
             continue

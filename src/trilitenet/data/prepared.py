@@ -367,7 +367,7 @@ class PreparedDataset:
             image=image,
             boxes=np.array(entry["boxes"], np.float32).reshape(-1, 4) if labelled else None,
             class_id=np.array(entry["class_id"], np.int64) if labelled else None,
-            ignored=np.array(entry["ignored"], np.float32).reshape(-1, 4),
+            ignored=np.array(entry["ignored"] if labelled else [], np.float32).reshape(-1, 4),
             drivable=masks["drivable"],
             lane=masks["lane"],
             **{key: values.view(np.bool_) for key in VALID if (values := masks[key]) is not None},

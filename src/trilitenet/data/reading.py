@@ -346,10 +346,10 @@ class DrivingDataset:
         attributes: dict[str, str] = {}
         content = self._annotation(name)
         if content is not None:
-            boxes, class_id, ignored, attributes = parse_annotation(
-                content, self._table, self.description.ignore, size, name
-            )
-            if "detection" not in self._tasks:
+            labelled = "detection" in self._tasks
+            table, ignore = (self._table, self.description.ignore) if labelled else ({}, ())
+            boxes, class_id, ignored, attributes = parse_annotation(content, table, ignore, size, name)
+            if not labelled:
                 boxes = class_id = None
         drivable, drivable_valid = self._mask("drivable", name, size)
         lane, lane_valid = self._mask("lane", name, size)
