@@ -96,6 +96,8 @@ def test_a_link_stays_a_link(tmp_path: Path) -> None:
 def test_names_that_are_taken_get_a_number() -> None:
     free = FreeNames()
     assert [free.give(name) for name in ("a", "a-2", "a", "b", "a", "a-2")] == ["a", "a-2", "a-3", "b", "a-4", "a-2-2"]
+    files = FreeNames(files=True)
+    assert [files.give(name) for name in ("A", "a", "B", "A-2", "a", "A")] == ["A", "a-2", "B", "A-2-2", "a-3", "A-4"]
 
 
 def test_a_hundred_thousand_things_of_one_name_are_named_at_once() -> None:

@@ -25,7 +25,7 @@ import secrets
 import stat
 import tempfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Final
@@ -199,18 +199,23 @@ def part_of(path: Path) -> Path:
 
 
 class FreeNames:
-    """Gives names of which no two are the same: the second ``a`` becomes ``a-2``."""
+    """Gives names of which no two are the same: the second ``a`` becomes ``a-2``.
 
-    def __init__(self) -> None:
+    Args:
+        files: Names of files, which Windows and macOS do not tell apart by their case: an ``A`` becomes ``A-2`` too.
+    """
+
+    def __init__(self, *, files: bool = False) -> None:
+        self._key: Callable[[str], str] = str.casefold if files else str
         self._last: dict[str, int] = {}  # given name -> the last number that was put at its end
 
     def give(self, name: str) -> str:
         """Return the name, or one with ``-2``, ``-3`` ... at the end if it was given before."""
-        free = name
-        while free in self._last:
-            self._last[name] += 1
-            free = f"{name}-{self._last[name]}"
-        self._last[free] = 1
+        free, key = name, self._key(name)
+        while self._key(free) in self._last:
+            self._last[key] += 1
+            free = f"{name}-{self._last[key]}"
+        self._last[self._key(free)] = 1
         return free
 
 

@@ -564,7 +564,7 @@ def _numbered(file: str) -> str:
 
 def _allot_stems(names: Sequence[str]) -> dict[str, str]:
     """Return a file name without ending for each source; the second ``a`` becomes ``a-2``."""
-    free = FreeNames()
+    free = FreeNames(files=True)
     return {name: free.give(PurePath(name).stem or "image") for name in dict.fromkeys(names)}
 
 

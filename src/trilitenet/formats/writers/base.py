@@ -73,7 +73,7 @@ class Writer(abc.ABC):
         self.files: list[Path] = []
         self._begun: list[Path] = []
         self._stems: dict[str, str] = {}
-        self._free = FreeNames()
+        self._free = FreeNames(files=True)
         self._names: Counter[str] = Counter()
         self._unnamed = 0
         self._empty = True
