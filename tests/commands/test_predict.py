@@ -4,6 +4,7 @@ import io
 import itertools
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -313,6 +314,24 @@ def test_an_interrupted_run_goes_on_where_it_was(
     assert predict_with(predictor, pictures[:1], tmp_path / "two").images == 1
     report = predict_with(predictor, pictures, tmp_path / "two", skip_existing=True)
     assert (report.images, report.skipped) == (1, 1)
+
+
+def test_results_of_another_source_of_the_same_name_are_not_taken_for_done(
+    folder: Path, tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for place in ("one", 'tw"o'):
+        (tmp_path / place).mkdir()
+        shutil.copy(folder / "photo.jpg", tmp_path / place / "x.jpg")
+    one, two, output = tmp_path / "one/x.jpg", tmp_path / 'tw"o/x.jpg', tmp_path / "out"
+    predict_with(predictor, [two, one], output)
+    (output / "x-2.jpg").unlink()
+    with pytest.raises(OutputError, match=r'x\.json: is of .*tw"o/x\.jpg, not of .*one/x\.jpg; name the same sources'):
+        predict_with(predictor, [one, two], output, skip_existing=True)
+    monkeypatch.chdir(one.parent)
+    report = predict_with(predictor, [two, "x.jpg"], output, skip_existing=True)
+    assert (report.images, report.skipped) == (1, 1)
+    two.rename(two.with_name("y.jpg"))
+    assert predict_with(predictor, [one], output, skip_existing=True).skipped == 1  # nobody knows better
 
 
 def test_the_mark_of_a_video_that_failed_is_there_before_its_results(

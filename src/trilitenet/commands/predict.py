@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import json
 import os
 import re
 import time
@@ -48,6 +49,8 @@ from trilitenet.structures import Perception
 
 __all__ = ["PredictReport", "RoadOptions", "predict", "predict_with"]
 
+_HEAD: Final = 65536
+"""Bytes of a JSON file in which its source is named, though the file may be as long as a video."""
 _JPEG_QUALITY: Final = 92
 """Of overlays on pictures, of 100."""
 
@@ -334,6 +337,7 @@ class _Job:
 
         Raises:
             ConfigError: If a format gathers several sources in one file.
+            OutputError: If results that are there say that they are of another source of the same name.
         """
         for name in self.formats:
             writer = find_writer(name)
@@ -344,6 +348,9 @@ class _Job:
                         f"--skip-existing needs formats with a file for each source, and {name} has one {pattern} for "
                         "all; choose another --format, or --overwrite"
                     )
+        if "json" in self.formats:
+            for name in self.names:
+                _check_source(self.output / f"{self.stems[name]}.json", name)
         left = {
             name
             for source in self.sources
@@ -547,6 +554,24 @@ def _follow(perception: Perception, parts: tuple[Steady | None, RoadMonitor | No
     if steady is not None:
         perception = steady(perception)
     return perception, None if monitor is None else monitor(perception)
+
+
+def _check_source(path: Path, name: str) -> None:
+    """Refuse results in JSON of another file than the source called ``name``, where both are there to compare.
+
+    Raises:
+        OutputError: If they are.
+    """
+    if not path.is_file():
+        return
+    with path.open("rb") as file:
+        found = re.match(rb'{"schema": "[^"]*", "source": ("(?:[^"\\]|\\.)*")', file.read(_HEAD))
+    other = Path(json.loads(found[1]) if found else name)
+    if other.exists() and Path(name).exists() and not other.samefile(name):
+        raise OutputError(
+            f"{path}: is of {other}, not of {name}; name the same sources in the same order as before, "
+            "or another --output"
+        )
 
 
 def _names(source: Stills | FrameReader) -> list[str]:
