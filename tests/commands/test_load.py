@@ -93,7 +93,8 @@ def test_a_runtime_that_weights_do_not_run_on_tells_its_export(backend: str, for
 
 @pytest.mark.parametrize("options", [{"threads": 0}, {"threads": -1}, {"streams": 0}])
 def test_counts_below_one_are_refused_before_a_runtime_sees_them(options: dict[str, int]) -> None:
-    with pytest.raises(ConfigError, match="streams and threads must be at least 1"):
+    ((name, count),) = options.items()
+    with pytest.raises(ConfigError, match=f"^{name} must be at least 1, got {count}$"):
         trilitenet.load("no.ncnn.param", threads=options.get("threads"), streams=options.get("streams", 1))
 
 

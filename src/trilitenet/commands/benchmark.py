@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trilitenet
-from trilitenet.commands.load import load
+from trilitenet.commands.load import check_parallel, load
 from trilitenet.commands.paths import check_writable, text_paths
 from trilitenet.config import VARIANTS, check_size
 from trilitenet.engine.provenance import peak_memory
@@ -179,8 +179,7 @@ def benchmark(
         raise ConfigError("nothing to measure: name at least one --backend and one --batch")
     if min(rounds, *batch) < 1 or warmup < 0:
         raise ConfigError("--rounds and --batch must be at least 1, --warmup not negative")
-    if streams < 1 or (threads is not None and threads < 1):
-        raise ConfigError(f"--streams and --threads must be at least 1, got {streams} and {threads}")
+    check_parallel(streams=streams, threads=threads)
     check_size(size, "--size")
     if min(source) < 1:
         raise ConfigError(f"--source must be at least 1x1, got {source[0]}x{source[1]} (height x width)")

@@ -14,7 +14,7 @@ from trilitenet.inference.backend import Backend
 from trilitenet.inference.exported import is_int8_onnx
 from trilitenet.inference.predictor import Predictor
 
-__all__ = ["BACKENDS", "load", "open_backend"]
+__all__ = ["BACKENDS", "check_parallel", "load", "open_backend"]
 
 BACKENDS = ("auto", "torch", "onnxruntime", "openvino", "ncnn", "tensorrt")
 """What ``backend`` may be."""
@@ -72,8 +72,7 @@ def load(
     """
     if backend not in BACKENDS:
         raise ConfigError(f"unknown backend {backend!r}{did_you_mean(backend, BACKENDS)}")
-    if streams < 1 or (threads is not None and threads < 1):
-        raise ConfigError(f"streams and threads must be at least 1, got {streams} and {threads}")
+    check_parallel(streams=streams, threads=threads)
     with needing_torch():
         runtime = open_backend(model, device, backend, streams, threads)
     try:
@@ -82,6 +81,17 @@ def load(
     except ConfigError as error:
         runtime.close()
         raise ConfigError(f"{model}: {error}") from error
+
+
+def check_parallel(**counts: int | None) -> None:
+    """Refuse a number of streams or threads below 1, by its name.
+
+    Raises:
+        ConfigError: If one is.
+    """
+    for name, count in counts.items():
+        if count is not None and count < 1:
+            raise ConfigError(f"{name} must be at least 1, got {count}")
 
 
 def open_backend(
