@@ -74,6 +74,15 @@ def test_models_take_turns(artefacts: Artefacts, tmp_path: Path) -> None:
     assert "| model.xml | openvino cpu" in result.summary()
 
 
+def test_the_table_tells_the_input_of_each_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    canvases = {"small.onnx": (32, 64), "large.onnx": (64, 128), "any": None}
+    monkeypatch.setattr(
+        "trilitenet.commands.benchmark.load", lambda model, **_: Predictor(ColourBackend(canvases[model]))
+    )
+    rows = benchmark(*canvases, rounds=1, warmup=0, size=(96, 160)).summary().splitlines()[4:7]
+    assert [row.split(" | ")[3] for row in rows] == ["64x32", "128x64", "160x96"]
+
+
 def test_whole_frames(artefacts: Artefacts) -> None:
     result = benchmark(str(artefacts.folder / "model.xml"), stage="frame", rounds=2, warmup=0, source=(90, 160))
     assert result.timings[0].stage == "frame"
@@ -139,8 +148,9 @@ def test_whole_frames_take_the_size_asked_for(monkeypatch: pytest.MonkeyPatch) -
         return plain(self, batch)
 
     monkeypatch.setattr(TorchBackend, "run", run)
-    benchmark("tiny", stage="frame", device="cpu", rounds=1, warmup=0, size=(64, 128), source=(72, 128))
+    result = benchmark("tiny", stage="frame", device="cpu", rounds=1, warmup=0, size=(64, 128), source=(72, 128))
     assert set(seen) == {(1, 96, 128, 3)}
+    assert result.timings[0].size == (96, 128)
 
 
 def test_a_ratio_above_1_is_faster_than_the_first(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -42,6 +42,7 @@ class Timing:
         backend: The runtime, device and precision.
         stage: ``"network"`` (letterboxed pixels to raw outputs) or ``"frame"`` (image to boxes and masks of its size).
         batch: Images a call.
+        size: (height, width) of the network's input in pixels.
         p50: Median milliseconds a call.
         p90: 90th percentile.
         p99: 99th percentile.
@@ -56,6 +57,7 @@ class Timing:
     backend: str
     stage: str
     batch: int
+    size: tuple[int, int]
     p50: float
     p90: float
     p99: float
@@ -118,13 +120,14 @@ class Benchmark:
         if self.timings:
             lines += [
                 "",
-                "| model | runtime | stage | batch | p50 ms | p90 | p99 | frames/s | ratio | first s | J/frame | W |",
-                "|---|---|---|---|---|---|---|---|---|---|---|---|",
+                "| model | runtime | stage | input | batch | p50 ms | p90 | p99 | frames/s | ratio | first s | J/frame "
+                "| W |",
+                "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
             ]
             lines += [
-                f"| {row.model} | {row.backend} | {row.stage} | {row.batch} | {row.p50:.2f} | {row.p90:.2f} "
-                f"| {row.p99:.2f} | {row.frames_per_second:.1f} | {row.ratio:.2f} | {row.first_result:.2f} "
-                f"| {_or_dash(row.joules)} | {_or_dash(row.watts)} |"
+                f"| {row.model} | {row.backend} | {row.stage} | {row.size[1]}x{row.size[0]} | {row.batch} "
+                f"| {row.p50:.2f} | {row.p90:.2f} | {row.p99:.2f} | {row.frames_per_second:.1f} | {row.ratio:.2f} "
+                f"| {row.first_result:.2f} | {_or_dash(row.joules)} | {_or_dash(row.watts)} |"
                 for row in self.timings
             ]
             memory = "" if self.peak_memory is None else f", peak memory {self.peak_memory / 2**20:.0f} MiB in all"
@@ -235,13 +238,14 @@ class _Call:
         self.joules: list[float] = []
         predictor = entry.predictor
         if stage == "network":
-            height, width = predictor.backend.canvas or size
-            images = generator.integers(0, 256, (batch, height, width, 3), np.uint8)
+            self.size = predictor.backend.canvas or size
+            images = generator.integers(0, 256, (batch, *self.size, 3), np.uint8)
             self.run: Callable[[], object] = lambda: predictor.backend.run(images)
         else:
             frames: list[NDArray[np.uint8]] = [generator.integers(0, 256, (*source, 3), np.uint8)] * batch
             if predictor.backend.canvas is None:
                 predictor = Predictor(predictor.backend, predictor.thresholds, long_side=max(size))
+            self.size = predictor.fit(frames[0]).canvas
             self.run = lambda: predictor.perceive(frames)
 
     def once(self) -> None:
@@ -280,6 +284,7 @@ def _measure(calls: Sequence[_Call], rounds: int, warmup: int) -> tuple[Timing, 
                 backend=call.entry.predictor.backend.name,
                 stage=call.stage,
                 batch=call.batch,
+                size=call.size,
                 p50=p50,
                 p90=p90,
                 p99=p99,
