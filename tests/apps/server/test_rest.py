@@ -4,6 +4,7 @@ import asyncio
 import dataclasses
 import io
 import json
+import time
 from typing import Any
 
 import numpy as np
@@ -245,6 +246,22 @@ def test_probes_follow_the_life_of_the_service(app: Application) -> None:
         assert answer.headers["connection"] == "close"
         assert client.get("/v1/models").json()["models"][0]["ready"] is False
     assert client.get("/healthz").status_code == 503
+
+
+def test_a_backend_that_does_not_come_back_is_told_to_the_probes(
+    make_app: MakeApp, backend: FakeBackend, jpeg: bytes
+) -> None:
+    with TestClient(make_app(deadline=0.2)) as client:
+        backend.gate.clear()
+        assert client.post("/v1/predict", content=jpeg).json()["error"]["code"] == "deadline"
+        time.sleep(0.1)  # the batch began after the image came
+        assert [client.get(path).status_code for path in ("/healthz", "/readyz", "/v2/health/live")] == [503] * 3
+        assert "trilitenet_ready 0.0" in client.get("/metrics").text
+        backend.gate.set()
+        until = time.monotonic() + 10
+        while client.get("/readyz").status_code != 200:
+            assert time.monotonic() < until
+        assert client.get("/healthz").status_code == 200
 
 
 def test_a_wrong_address_or_method_is_told_what_is_right(client: TestClient) -> None:

@@ -131,6 +131,7 @@ class Batcher:
         self._waiting: deque[_Item] = deque()
         self._changed = threading.Condition()
         self._closing = False
+        self._began: float | None = None
         self._thread = threading.Thread(target=self._loop, name="trilitenet-batcher", daemon=True)
 
     def start(self) -> None:
@@ -141,6 +142,12 @@ class Batcher:
     def alive(self) -> bool:
         """Whether the thread runs."""
         return self._thread.is_alive()
+
+    @property
+    def busy(self) -> float:
+        """Seconds since the batch that runs was begun; 0 if none runs."""
+        began = self._began
+        return 0.0 if began is None else time.monotonic() - began
 
     @property
     def length(self) -> int:
@@ -183,7 +190,9 @@ class Batcher:
             if batch is None:
                 return
             if batch:
-                self._run_batch(batch)
+                self._began = time.monotonic()
+                self._run_batch(batch, self._began)
+                self._began = None
 
     def _next_batch(self) -> list[_Item] | None:
         """Wait for work; None when there is none left and the batcher is closing."""
@@ -217,8 +226,7 @@ class Batcher:
         self._waiting.extendleft(reversed(others))
         return batch
 
-    def _run_batch(self, batch: list[_Item]) -> None:
-        start = time.monotonic()
+    def _run_batch(self, batch: list[_Item], start: float) -> None:
         try:
             raw = self._run(np.stack([item.canvas for item in batch]))
             pieces = split(raw, len(batch))

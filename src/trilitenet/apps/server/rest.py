@@ -101,7 +101,7 @@ def rest_router(service: Service) -> APIRouter:
 
     @router.get("/readyz", tags=["operation"], **openapi.PROBE)
     async def readyz() -> Response:
-        """Say whether new requests are welcome: 503 while shutting down."""
+        """Say whether new requests are welcome: 503 while shutting down, and when the process should be restarted."""
         return _probe(service.ready)
 
     @router.get("/metrics", tags=["operation"], **openapi.METRICS)

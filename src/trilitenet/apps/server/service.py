@@ -100,12 +100,17 @@ class Service:
     @property
     def ready(self) -> bool:
         """Whether new requests are welcome."""
-        return self._warm and not self.draining and self._batcher.alive
+        return self._warm and not self.draining and self._works
 
     @property
     def alive(self) -> bool:
         """Whether the service can still do its work, now or once it is ready."""
-        return not self._warm or self._batcher.alive
+        return not self._warm or self._works
+
+    @property
+    def _works(self) -> bool:
+        """Whether images come through: a batch that the backend does not return from holds all others up."""
+        return self._batcher.alive and self._batcher.busy <= self.settings.deadline
 
     async def start(self) -> None:
         """Start the threads and take one grey image the whole way, so that the first request is not slow."""
