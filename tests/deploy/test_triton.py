@@ -59,7 +59,7 @@ def test_the_config_says_what_the_artefact_is(tmp_path: Path, schema: Any) -> No
         ("detection", schema.TYPE_FP32, [1, -1, 6]),
         ("lane", schema.TYPE_UINT8, [1, 384, 640, 3]),
     ]
-    assert config.instance_group[0].kind == schema.ModelInstanceGroup.KIND_CPU
+    assert config.instance_group[0].kind == schema.ModelInstanceGroup.KIND_AUTO
     assert ModelCard.from_json(config.parameters["trilitenet.card"].string_value, "x") == card
     assert (model / "1" / "model.onnx").read_bytes() == artefact.read_bytes()
 

@@ -103,7 +103,7 @@ def _config(name: str, inputs: list[TensorSpec], outputs: list[TensorSpec], card
         "max_batch_size: 0",  # the batch of 1 is part of the graph's shapes
         *(_tensor("input", tensor) for tensor in inputs),
         *(_tensor("output", tensor) for tensor in outputs),
-        "instance_group [ { kind: KIND_CPU, count: 1 } ]",
+        "instance_group [ { kind: KIND_AUTO, count: 1 } ]",
         f'parameters {{ key: "trilitenet.card" value {{ string_value: {_quote(card.to_json())} }} }}',
     ]
     return "\n".join(lines) + "\n"
