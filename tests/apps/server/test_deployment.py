@@ -17,6 +17,8 @@ import yaml
 from starlette.testclient import TestClient
 
 from tests.apps.server.conftest import MakeApp
+from trilitenet.apps.server.metrics import Metrics
+from trilitenet.apps.server.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -96,6 +98,13 @@ def test_dashboard_and_alerts_ask_for_what_the_service_counts(make_app: MakeApp)
         names = set(re.findall(r"\b(?:trilitenet|process)_\w+|\bup\b", expression))
         assert names, expression
         assert names <= known, expression
+
+
+def test_the_longest_request_that_the_limits_allow_has_a_bucket() -> None:
+    metrics, limits = Metrics(), Settings()
+    metrics.answer("/v1/predict", "POST", 200, limits.upload_timeout + limits.deadline + limits.answer_timeout)
+    line = 'trilitenet_request_seconds_bucket{le="100.0",route="/v1/predict"} 1.0'
+    assert line in metrics.text().decode().splitlines()
 
 
 def test_probes_of_a_service_that_is_not_ready_are_no_refused_requests(make_app: MakeApp) -> None:

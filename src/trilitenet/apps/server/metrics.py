@@ -21,7 +21,7 @@ __all__ = ["STAGES", "Metrics"]
 STAGES: Final = ("upload", "decode", "preprocess", "queue", "network", "postprocess", "encode")
 """The stages of a request, in their order; each has a latency histogram."""
 
-_SECONDS: Final = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
+_SECONDS: Final = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 25.0, 50.0, 100.0)
 
 
 class Metrics:
