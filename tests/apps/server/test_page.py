@@ -275,12 +275,12 @@ def test_the_slider_begins_at_the_confidence_that_is_served(browser: Page, photo
     ("classes", "tasks", "title", "boxes"),
     [
         (("vehicle",), ("detection",), "Vehicles", "Vehicles"),
-        (("person", "bus"), TASKS, "Objects, drivable area and lane markings", "Objects"),
+        (("bus", "person"), TASKS, "Objects, drivable area and lane markings", "Objects"),
         (("vehicle",), ("drivable", "lane"), "Drivable area and lane markings", "Vehicles"),
     ],
 )
 def test_the_page_names_what_the_model_sees(
-    browser: Page, classes: tuple[str, ...], tasks: tuple[Task, ...], title: str, boxes: str
+    browser: Page, photo: Path, classes: tuple[str, ...], tasks: tuple[Task, ...], title: str, boxes: str
 ) -> None:
     backend = FakeBackend()
     backend.card = dataclasses.replace(backend.card, class_names=classes, tasks=tasks)
@@ -292,8 +292,24 @@ def test_the_page_names_what_the_model_sees(
         assert browser["opacity-detection"].get_attribute("aria-label") == f"Opacity of {boxes.lower()}"
         assert {name for name in TASKS if browser[f"show-{name}"].is_enabled()} == set(tasks)
         assert browser["confidence"].is_displayed() == ("detection" in tasks)
+        if tasks == TASKS:
+            assert browser.see(photo).startswith("2 buses;")
     finally:
         assert running.stop()
+
+
+def test_what_is_counted_is_named_in_the_plural(page: Page) -> None:
+    names = {
+        "bus": "buses",
+        "person": "persons",
+        "bicycle": "bicycles",
+        "traffic light": "traffic lights",
+        "ambulance": "ambulances",
+        "box": "boxes",
+        "couch": "couches",
+    }
+    said = page.script("const { plural } = await import('/client.js'); return arguments[0].map(plural)", list(names))
+    assert said == list(names.values())
 
 
 def test_overlay_and_json_are_saved(page: Page, server: Running, photo: Path) -> None:

@@ -1,6 +1,6 @@
 // The page: wires the controls to what is seen. No library, no build step, no request but to this service.
 
-import { ServiceError, capital, getModel, pause, predict, predictBatch, setToken } from "./client.js";
+import { ServiceError, capital, getModel, pause, plural, predict, predictBatch, setToken } from "./client.js";
 import { drawFrame, prepare, shownBoxes } from "./draw.js";
 import { openCamera, openClip, openPhoto } from "./sources.js";
 
@@ -58,7 +58,7 @@ function describe(boxes) {
   if (current.boxes) {
     const counts = new Map();
     for (const box of boxes) counts.set(box.class_name, (counts.get(box.class_name) ?? 0) + 1);
-    const names = [...counts].map(([name, count]) => `${count} ${name}${count === 1 ? "" : "s"}`);
+    const names = [...counts].map(([name, count]) => `${count} ${count === 1 ? name : plural(name)}`);
     parts.push(names.length ? names.join(", ") : `no ${current.perception.class_names.join(" or ")}`);
   }
   const percent = (share) => `${(100 * share).toFixed(share < 0.1 ? 1 : 0)} %`;

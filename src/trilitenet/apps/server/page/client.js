@@ -40,6 +40,10 @@ export function capital(text) {
   return `${text.charAt(0).toUpperCase()}${text.slice(1)}`;
 }
 
+export function plural(name) {
+  return `${name}${/(s|x|ch|sh)$/.test(name) ? "es" : "s"}`;
+}
+
 function sentence(text) {
   return `${capital(text)}${/[.!?]$/.test(text) ? "" : "."}`;
 }
