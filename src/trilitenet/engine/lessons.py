@@ -8,7 +8,6 @@ crop as the image does.
 from __future__ import annotations
 
 import dataclasses
-import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -16,6 +15,7 @@ from typing import Any, Final
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from trilitenet.config import TASKS, Task
 from trilitenet.data.sample import Sample
@@ -26,7 +26,6 @@ from trilitenet.structures import Perception
 
 __all__ = ["Lessons", "TaughtTransform"]
 
-_PNG: Final = b"\x89PNG\r\n\x1a\n"
 _HALF: Final = 127
 """An area-resized mask pixel (0 to 255) above this is foreground, which keeps a mask's area."""
 _FIELDS: Final[dict[Task, tuple[str, ...]]] = {
@@ -177,14 +176,11 @@ def _png_size(path: Path) -> tuple[int, int]:
     Raises:
         DataError: If it is none.
     """
-    with path.open("rb") as file:
-        header = file.read(24)
-    if len(header) < 24 or not header.startswith(_PNG):
-        raise DataError(f"{path}: not a PNG image")
-    width, height = struct.unpack(">II", header[16:])
-    if not width or not height:
-        raise DataError(f"{path}: not a PNG image")
-    return height, width
+    try:
+        with Image.open(path, formats=["PNG"]) as image:
+            return image.height, image.width
+    except (OSError, Image.DecompressionBombError) as error:
+        raise DataError(f"{path}: not a PNG image") from error
 
 
 def _resized(mask: NDArray[np.bool_] | None, size: tuple[int, int]) -> NDArray[np.uint8] | None:
