@@ -192,7 +192,7 @@ def _resized(predictor: Predictor, sides: Sequence[int]) -> dict[int, EvaluatedP
 
 
 def hash_model(model: str) -> str | None:
-    """Return the SHA-256 of a weight file, or of the files of an exported artefact."""
+    """Return the SHA-256 of a weight file, as ``sha256sum`` prints it, or of the files of an exported artefact."""
     path = shipped_weights().get(model) or Path(model)
     if path.is_dir():
         return hash_files(file for file in path.rglob("*") if file.is_file())
@@ -201,12 +201,7 @@ def hash_model(model: str) -> str | None:
     files = [file for file in map(path.with_suffix, beside) if file.is_file()]
     if files and path.is_file():
         return hash_files([path, *files])
-    return hash_file(path) if path.is_file() else None
-
-
-def hash_file(path: Path) -> str:
-    """Return the SHA-256 of a file, as ``sha256sum`` prints it."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
 
 
 def hash_dataset(dataset: DrivingDataset, limit: int | None = None) -> dict[str, str]:
