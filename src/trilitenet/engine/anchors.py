@@ -20,6 +20,12 @@ __all__ = ["AnchorFit", "best_possible_recall", "box_sizes", "fit_anchors"]
 
 PER_LEVEL = 3
 """Anchors a level."""
+_MOST_READ = 5000
+"""At most so many images are read, drawn at random."""
+_RATIO = 4.0
+"""An anchor takes boxes whose sides differ from its own by less, see `trilitenet.losses.detection.match`."""
+_LEAST = 2.0
+"""Boxes with a side under so many pixels are left out."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +63,6 @@ def box_sizes(
     dataset: SampleSource,
     canvas: tuple[int, int],
     *,
-    limit: int = 5000,
     seed: int = 0,
     swapped: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -67,13 +72,12 @@ def box_sizes(
     Args:
         dataset: Where samples come from.
         canvas: (height, width) of the input.
-        limit: At most so many images are read, drawn at random.
-        seed: Of that draw.
+        seed: Of the draw of images.
         swapped: As the published code has it: the width, as a share of the image's, times the height of the resized
             image, and the height times its width.
         progress: Called with how many images are read, and of how many.
     """
-    order = np.random.default_rng(seed).permutation(len(dataset))[:limit]
+    order = np.random.default_rng(seed).permutation(len(dataset))[:_MOST_READ]
     sizes = [np.zeros((0, 2))]
     for done, index in enumerate(order, start=1):
         sample = dataset[int(index)]
@@ -87,33 +91,22 @@ def box_sizes(
     return np.concatenate(sizes)
 
 
-def best_possible_recall(sizes: NDArray[np.float64], anchors: NDArray[np.float64], ratio_limit: float = 4.0) -> float:
+def best_possible_recall(sizes: NDArray[np.float64], anchors: NDArray[np.float64]) -> float:
     """Return the share of boxes that at least one anchor takes.
 
     Args:
         sizes: (N, 2) width and height.
         anchors: (A, 2) width and height in the same unit.
-        ratio_limit: See `trilitenet.losses.detection.match`.
     """
-    return float((best_side_ratio(sizes, anchors) > 1 / ratio_limit).mean())
+    return float((best_side_ratio(sizes, anchors) > 1 / _RATIO).mean())
 
 
-def fit_anchors(
-    sizes: NDArray[np.float64],
-    before: Anchors,
-    *,
-    ratio_limit: float = 4.0,
-    min_side: float = 2.0,
-    enough: float = math.inf,
-    seed: int = 0,
-) -> AnchorFit:
+def fit_anchors(sizes: NDArray[np.float64], before: Anchors, *, enough: float = math.inf, seed: int = 0) -> AnchorFit:
     """Fit nine anchors by k-means, and keep the old ones where they suit no worse, or well enough.
 
     Args:
         sizes: (N, 2) width and height of boxes in input pixels.
         before: Anchors to compare with.
-        ratio_limit: See `trilitenet.losses.detection.match`.
-        min_side: Boxes with a side under so many pixels are left out.
         enough: Keep the old ones when their best possible recall reaches this.
         seed: Of k-means.
 
@@ -123,7 +116,7 @@ def fit_anchors(
     """
     cluster: Any = import_extra("scipy.cluster.vq", "train")
     count = len(STRIDES) * PER_LEVEL
-    sizes = sizes[(sizes >= min_side).all(axis=1)]
+    sizes = sizes[(sizes >= _LEAST).all(axis=1)]
     different = len(np.unique(sizes, axis=0))
     if different < count:
         raise DataError(
@@ -137,9 +130,7 @@ def fit_anchors(
         centres = np.concatenate([centres, np.log(extra)])
     new = np.exp(centres)
     new = np.round(new[np.argsort(new.prod(axis=1))], 1)
-    scores = [
-        (best_possible_recall(sizes, a, ratio_limit), float(best_side_ratio(sizes, a).mean())) for a in (old, new)
-    ]
+    scores = [(best_possible_recall(sizes, a), float(best_side_ratio(sizes, a).mean())) for a in (old, new)]
     changed = scores[0][0] < enough and scores[1][1] > scores[0][1] and scores[1][0] >= scores[0][0] - 1e-3
     chosen = new if changed else old
     anchors = tuple(
