@@ -45,6 +45,7 @@ __all__ = [
     "WeightsError",
     "brief",
     "did_you_mean",
+    "folder_beside",
     "import_extra",
     "part_of",
     "replacing",
@@ -239,6 +240,14 @@ def replacing(path: Path) -> Iterator[Path]:
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+
+
+@contextlib.contextmanager
+def folder_beside(path: Path) -> Iterator[Path]:
+    """Yield a hidden folder beside ``path``, which goes with the block, to make in it what takes its place."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name[:_BEGINNING]}.") as folder:
+        yield Path(folder)
 
 
 def write_file(path: Path, content: str | bytes) -> None:

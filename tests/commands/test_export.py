@@ -205,7 +205,7 @@ def test_what_cannot_be_written_is_told_in_one_line(
 
 
 def test_an_interruption_leaves_no_half_of_an_artefact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = ["a.bin", "a.xml"]
+    names = [f"{'a' * 251}.bin", f"{'a' * 251}.xml"]  # as long as file systems take names
     for name in names:
         (tmp_path / name).write_text("old")
     plain = Path.replace
@@ -217,7 +217,7 @@ def test_an_interruption_leaves_no_half_of_an_artefact(tmp_path: Path, monkeypat
     monkeypatch.setattr(Path, "replace", replace)
 
     def put() -> None:
-        with command._trial(tmp_path / "a.xml") as trial:
+        with command._trial(tmp_path / names[1]) as trial:
             for name in names:
                 trial.with_name(name).write_text("new")
 

@@ -67,13 +67,14 @@ def test_the_config_says_what_the_artefact_is(tmp_path: Path, schema: Any) -> No
 def test_a_model_is_replaced_whole(tmp_path: Path) -> None:
     artefact = _artefact(tmp_path / "x.onnx")
     repository = tmp_path / "repository"
-    model = write_triton_repository(artefact, repository, ModelCard("tiny"), name="mine")
+    name = "m" * 255  # as long as file systems take names
+    model = write_triton_repository(artefact, repository, ModelCard("tiny"), name=name)
     (model / "2").mkdir()
     with pytest.raises(OutputError, match="exists already"):
-        write_triton_repository(artefact, repository, ModelCard("tiny"), name="mine")
-    assert write_triton_repository(artefact, repository, ModelCard("base"), name="mine", overwrite=True) == model
+        write_triton_repository(artefact, repository, ModelCard("tiny"), name=name)
+    assert write_triton_repository(artefact, repository, ModelCard("base"), name=name, overwrite=True) == model
     assert [path.name for path in sorted(model.rglob("*"))] == ["1", "model.onnx", "config.pbtxt"]
-    assert [path.name for path in repository.iterdir()] == ["mine"]
+    assert [path.name for path in repository.iterdir()] == [name]
 
 
 def test_types_are_named_as_triton_names_them(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ import dataclasses
 import io
 import math
 import re
-import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
@@ -32,7 +31,16 @@ from trilitenet.deploy.quantize import KEEP_STEPS, quantize_onnx, quantize_openv
 from trilitenet.deploy.tensorrt import build_engine, is_installed, trtexec_line
 from trilitenet.deploy.triton import write_triton_repository
 from trilitenet.engine.evaluate import evaluate
-from trilitenet.errors import BackendError, ConfigError, InputError, OutputError, did_you_mean, scratch_folder, writing
+from trilitenet.errors import (
+    BackendError,
+    ConfigError,
+    InputError,
+    OutputError,
+    did_you_mean,
+    folder_beside,
+    scratch_folder,
+    writing,
+)
 from trilitenet.formats.writers.base import uninterrupted
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.exported import prepare_input
@@ -402,17 +410,15 @@ def _keep(
 @contextlib.contextmanager
 def _trial(path: Path) -> Iterator[Path]:
     """Yield a name beside the destination; what is written there is moved into place if nothing is raised."""
-    folder = str(path.parent)
+    folder = path.parent
     try:
-        with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
-                yield Path(folder) / path.name
-                with uninterrupted():  # files of an artefact belong together
-                    for part in Path(folder).iterdir():
-                        part.replace(path.parent / part.name)
+        with writing(path), folder_beside(path) as folder:
+            yield folder / path.name
+            with uninterrupted():  # files of an artefact belong together
+                for part in folder.iterdir():
+                    part.replace(path.parent / part.name)
     except OutputError as error:
-        raise OutputError(str(error).replace(folder, str(path.parent))) from error
+        raise OutputError(str(error).replace(str(folder), str(path.parent))) from error
 
 
 def _open(path: Path, info: ArtefactInfo) -> Backend:

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import json
 import shutil
-import tempfile
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from trilitenet.config import ModelCard
-from trilitenet.errors import OutputError, WeightsError, import_extra, writing
+from trilitenet.errors import OutputError, WeightsError, folder_beside, import_extra, writing
 
 __all__ = ["TensorSpec", "read_tensors", "write_triton_repository"]
 
@@ -61,16 +60,14 @@ def write_triton_repository(
     model = folder / (name or f"trilitenet_{card.variant}")
     if model.exists() and not overwrite:
         raise OutputError(f"{model}: exists already; give another --output or --overwrite")
-    with writing(model):
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=f".{model.name}.") as place:
-            made, former = Path(place) / "made", Path(place) / "former"
-            (made / "1").mkdir(parents=True)
-            shutil.copyfile(artefact, made / "1" / "model.onnx")
-            (made / "config.pbtxt").write_text(_config(model.name, inputs, outputs, card), encoding="utf-8")
-            if model.exists():
-                model.replace(former)
-            made.replace(model)
+    with writing(model), folder_beside(model) as place:
+        made, former = place / "made", place / "former"
+        (made / "1").mkdir(parents=True)
+        shutil.copyfile(artefact, made / "1" / "model.onnx")
+        (made / "config.pbtxt").write_text(_config(model.name, inputs, outputs, card), encoding="utf-8")
+        if model.exists():
+            model.replace(former)
+        made.replace(model)
     return model
 
 
