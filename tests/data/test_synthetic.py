@@ -171,7 +171,7 @@ def test_writing_refuses_to_mix_with_what_is_there(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_the_same_call_goes_on_where_one_was_interrupted(tmp_path: Path, workers: int) -> None:
-    def stop(done: int) -> None:
+    def stop(done: int, count: int) -> None:
         if done == 2:
             raise KeyboardInterrupt
 

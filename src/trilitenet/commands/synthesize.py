@@ -61,9 +61,5 @@ def synthesize(
         OutputError: If the split is there already, whole or of another command.
     """
     with show_progress("scenes") as shown:
-
-        def advance(done: int) -> None:
-            shown(done, count)
-
-        write_dataset(output, split, count, seed, size=size, labels=labels, workers=workers, progress=advance)
+        write_dataset(output, split, count, seed, size=size, labels=labels, workers=workers, progress=shown)
     return Synthesized(output, split, count)

@@ -34,7 +34,7 @@ def write_dataset(
     size: tuple[int, int] = (384, 640),
     labels: Literal["lines", "paint"] = "lines",
     workers: int = 1,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> None:
     """Write scenes in the published layout.
 
@@ -51,7 +51,7 @@ def write_dataset(
         size: (height, width) in pixels.
         labels: How lanes are marked (see `SyntheticScenes`).
         workers: Processes to share the work.
-        progress: Called with the number of scenes done after each.
+        progress: Called with how many scenes are done, and of how many.
 
     Raises:
         ConfigError: If ``count`` or ``workers`` is under 1, the seed negative, the size too small, or ``split`` no name
@@ -101,7 +101,7 @@ def write_dataset(
                 scenes = stack.enter_context(ProcessPool(workers)).map(job, range(count), chunksize=4)
             for done, _ in enumerate(scenes, start=1):
                 if progress:
-                    progress(done)
+                    progress(done, count)
         state.unlink()
     except OSError as error:
         raise OutputError(f"{root}: cannot write ({error})") from error
