@@ -64,13 +64,18 @@ def rest_router(service: Service) -> APIRouter:
         """See several images. One that is broken does not spoil the others: each has a status of its own."""
         images = await _all_images(request, service, request.scope["state"]["reservation"])
         with service.admit(len(images)) as deadline:
-            jobs = [
-                _settle(service.see(image, deadline, _to_mapping, confidence), service)
-                if isinstance(image, Encoded)
-                else _as_is(image)
-                for image in images
-            ]
-            results = await until_vanished(request, asyncio.gather(*jobs))
+
+            async def settle(image: Encoded | dict[str, Any]) -> dict[str, Any]:
+                if not isinstance(image, Encoded):
+                    return image
+                try:
+                    return await service.see(image, deadline, _to_mapping, confidence)
+                except ProblemError as problem:
+                    if problem.status != 503:
+                        service.admission.skip()
+                    return _refusal(problem)
+
+            results = await until_vanished(request, asyncio.gather(*map(settle, images)))
         if all(result["status"] == 503 for result in results):
             raise BusyError(**{name: results[0]["error"][name] for name in ("code", "message")})
         for result in results:
@@ -263,19 +268,6 @@ def _encode(pixels: NDArray[np.uint8], kind: str) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, kind, quality=90, compress_level=1)
     return buffer.getvalue()
-
-
-async def _settle(work: Coroutine[Any, Any, dict[str, Any]], service: Service) -> dict[str, Any]:
-    try:
-        return await work
-    except ProblemError as problem:
-        if problem.status != 503:
-            service.admission.skip()
-        return _refusal(problem)
-
-
-async def _as_is(result: dict[str, Any]) -> dict[str, Any]:
-    return result
 
 
 def _refusal(problem: ProblemError) -> dict[str, Any]:
