@@ -53,7 +53,9 @@ def rest_router(service: Service) -> APIRouter:
         confidence: Confidence = None,
     ) -> Response:
         """See one image: vehicles, drivable area and lane markings."""
-        image = await _one_image(request, service, request.scope["state"]["reservation"])
+        reservation = request.scope["state"]["reservation"]
+        (data,) = await _encoded(request, service, reservation, most=1)
+        image = _checked(data, service, reservation)
         finish = _finisher(output, request, service)
         with service.admit(1) as deadline:
             work = service.see(image, deadline, finish, confidence, keep_image=output == "overlay")
@@ -162,11 +164,6 @@ async def until_vanished(request: Request, work: Coroutine[Any, Any, _T] | async
 async def _disconnected(request: Request) -> None:
     while (await request.receive())["type"] != "http.disconnect":
         pass
-
-
-async def _one_image(request: Request, service: Service, reservation: Reservation) -> Encoded:
-    images = await _encoded(request, service, reservation, most=1)
-    return _checked(images[0], service, reservation)
 
 
 async def _all_images(request: Request, service: Service, reservation: Reservation) -> list[Encoded | dict[str, Any]]:
