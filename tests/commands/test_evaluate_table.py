@@ -13,7 +13,6 @@ from tests.artefacts import Artefacts
 from trilitenet.commands import evaluate_table as command
 from trilitenet.commands.evaluate_table import PrecisionRow, PrecisionTable, evaluate_table
 from trilitenet.data.synthetic_files import write_dataset
-from trilitenet.engine.report import Figure
 from trilitenet.errors import ConfigError, OutputError
 
 
@@ -71,7 +70,7 @@ def test_int8_is_named_by_what_calibrates_it(tmp_path: Path, monkeypatch: pytest
         evaluate_table("tiny", data=data, output=tmp_path, precisions=("fp32", "int8"), **options)
         return exported.copy()
 
-    report = SimpleNamespace(figures={"fair/lane/iou": Figure(0.5)}, provenance=SimpleNamespace(runtime="x"))
+    report = SimpleNamespace(values=lambda: {"fair/lane/iou": 0.5}, provenance=SimpleNamespace(runtime="x"))
     monkeypatch.setattr(command, "export", lambda *_, output, **__: exported.append(output.name))
     monkeypatch.setattr(command, "evaluate", lambda *_, **__: report)
     first, other = names(), names(calibration=tmp_path / "other")

@@ -213,8 +213,7 @@ def evaluate_table(
                     limit=limit,
                     overwrite=True,
                 )
-            figures = {key: figure.value for key, figure in report.figures.items()}
-            rows.append(PrecisionRow(model, precision, report.provenance.runtime, figures))
+            rows.append(PrecisionRow(model, precision, report.provenance.runtime, report.values()))
     table = PrecisionTable(tuple(rows))
     write_file(output / "precisions.md", table.summary() + "\n")
     return table

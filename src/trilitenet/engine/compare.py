@@ -171,9 +171,7 @@ def compare_reports(
     return Comparison(
         names=names,
         data={name: f"{report.provenance.data} {report.provenance.split}" for name, report in reports.items()},
-        figures={
-            name: {key: figure.value for key, figure in report.figures.items()} for name, report in reports.items()
-        },
+        figures={name: report.values() for name, report in reports.items()},
         differences=tuple(differences),
         unpaired=unpaired,
         confidence={

@@ -214,6 +214,10 @@ class Report:
         """The protocols that were used."""
         return tuple(name for name, scores in (("fair", self.fair), ("paper", self.paper)) if scores is not None)
 
+    def values(self) -> dict[str, float]:
+        """Return the figures without their intervals."""
+        return {key: figure.value for key, figure in self.figures.items()}
+
     def metrics(self) -> dict[str, FairMetrics | PaperMetrics]:
         """Return the metrics by protocol, filled, to compute further figures from."""
         return _metrics(self.state)

@@ -63,7 +63,7 @@ def corrupted_figures(
             report = evaluate(
                 predictor, dataset, change=_change(name, severity, seed), resamples=0, worst=0, **settings
             )
-            figures = _values(report)
+            figures = report.values()
             members.append(Variation(CORRUPTED, f"{name} {severity}", figures, detail=True))
         rows += members
         means.append(Variation(CORRUPTED, name, _mean(members, keys)))
@@ -71,7 +71,7 @@ def corrupted_figures(
     drop: dict[str, float] = {key: clean.figures[key].value - overall[key] for key in keys}
     note = f"Means over severities {', '.join(map(str, severities))}. The drop is the loss from the clean images."
     return (
-        Variation(CORRUPTED, "clean", _values(clean), note),
+        Variation(CORRUPTED, "clean", clean.values(), note),
         *means,
         Variation(CORRUPTED, "mean of corruptions", overall),
         Variation(CORRUPTED, "mean corruption drop", drop),
@@ -92,7 +92,7 @@ def figures_by_size(
     rows = []
     for long_side, predictor in predictors.items():
         report = evaluate(predictor, dataset, resamples=0, worst=0, **settings)
-        figures = _values(report)
+        figures = report.values()
         rows.append(Variation(SIZES, str(long_side), figures, "By the longer side of the network's input, in pixels."))
     return tuple(rows)
 
@@ -103,10 +103,6 @@ def _change(name: str, severity: int, seed: int) -> Callable[[NDArray[np.uint8],
         return corrupt(image, name, severity, np.random.default_rng(draw))
 
     return change
-
-
-def _values(report: Report) -> dict[str, float]:
-    return {key: figure.value for key, figure in report.figures.items()}
 
 
 def _mean(rows: Sequence[Variation], keys: Sequence[str]) -> dict[str, float]:
