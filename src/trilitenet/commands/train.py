@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import inspect
 import json
 import logging
@@ -187,20 +188,13 @@ def _take_part() -> None:
 
 def training_data(config: TrainConfig) -> SampleSource:
     """Open the data that a recipe trains on."""
-    above = config.augmentation.mask_above
-    first = open_dataset(
-        config.data, config.train_split, canvas=config.input_size, class_names=config.classes, mask_above=above
+    opened = functools.partial(
+        open_dataset, split=config.train_split, canvas=config.input_size, mask_above=config.augmentation.mask_above
     )
+    first = opened(config.data, class_names=config.classes)
     if not config.extra_data:
         return first
-    names = first.class_names
-    more = [
-        (
-            open_dataset(root, config.train_split, canvas=config.input_size, class_names=names, mask_above=above),
-            weight,
-        )
-        for root, weight in config.extra_data.items()
-    ]
+    more = [(opened(root, class_names=first.class_names), weight) for root, weight in config.extra_data.items()]
     return MixedDataset([(first, 1.0), *more])
 
 
