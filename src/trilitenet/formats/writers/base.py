@@ -23,7 +23,10 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path, PurePath
 from types import FrameType, TracebackType
-from typing import IO, TYPE_CHECKING, Any, ClassVar, Final
+from typing import IO, TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from trilitenet.errors import ConfigError, FreeNames, OutputError, did_you_mean, part_of, writing
 from trilitenet.structures import Perception
@@ -337,6 +340,26 @@ class JsonStream:
 def dumps(value: Any) -> str:
     """Return one line of JSON; not-a-number and infinity are refused, because JSON has neither."""
     return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+class Found(NamedTuple):
+    """A box of a perception; ``track_id`` is -1 where its identity is not known."""
+
+    corners: NDArray[np.float32]
+    name: str
+    class_id: int
+    confidence: float
+    track_id: int
+
+
+def objects(perception: Perception) -> Iterator[Found]:
+    """Yield the boxes of a perception, best first."""
+    boxes = perception.boxes
+    if boxes is None:
+        return
+    tracks = [-1] * len(boxes) if boxes.track_id is None else boxes.track_id.tolist()
+    names = [perception.class_names[class_id] for class_id in boxes.class_id]
+    yield from map(Found, boxes.xyxy, names, boxes.class_id.tolist(), boxes.confidence.tolist(), tracks)
 
 
 def polylines(road: Mapping[str, Any] | None) -> Iterator[tuple[int, list[list[float]]]]:

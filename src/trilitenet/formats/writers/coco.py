@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from trilitenet.formats.writers.base import JsonStream, Writer, dumps, rounded
+from trilitenet.formats.writers.base import JsonStream, Writer, dumps, objects, rounded
 from trilitenet.processing.serialise import encode_mask
 from trilitenet.structures import Perception
 
@@ -46,22 +46,21 @@ class CocoWriter(Writer):
         image_id = len(self._images) + 1
         image = {"id": image_id, "file_name": self.image_name(perception), "width": width, "height": height}
         self._images.append(image)
-        boxes = perception.boxes
         masks = {"drivable": perception.drivable, "lane": perception.lane}
-        self._tasks |= {task for task, result in {"detection": boxes, **masks}.items() if result is not None}
-        for index in range(0 if boxes is None else len(boxes)):
-            assert boxes is not None
-            left, top, right, bottom = rounded(boxes.xyxy[index])
+        results = {"detection": perception.boxes, **masks}
+        self._tasks |= {task for task, result in results.items() if result is not None}
+        for found in objects(perception):
+            left, top, right, bottom = rounded(found.corners)
             sides = [round(right - left, 2), round(bottom - top, 2)]
             annotation: dict[str, Any] = {
-                "category_id": int(boxes.class_id[index]) + 1,
+                "category_id": found.class_id + 1,
                 "bbox": [left, top, *sides],
                 "area": round(sides[0] * sides[1], 2),
                 "segmentation": [],
-                "score": round(float(boxes.confidence[index]), 4),
+                "score": round(found.confidence, 4),
             }
-            if boxes.track_id is not None and boxes.track_id[index] >= 0:
-                annotation["track_id"] = int(boxes.track_id[index])
+            if found.track_id >= 0:
+                annotation["track_id"] = found.track_id
             self._add(image_id, annotation)
         for place, mask in enumerate(masks.values(), start=1):
             if mask is None or not mask.any():

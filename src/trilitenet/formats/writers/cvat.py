@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.errors import part_of
-from trilitenet.formats.writers.base import Writer, polylines
+from trilitenet.formats.writers.base import Writer, objects, polylines
 from trilitenet.processing.polygons import mask_to_polygons
 from trilitenet.structures import Perception
 
@@ -150,14 +150,11 @@ class _ImagesFile:
                     f'    <mask label="{label}" source="auto" occluded="0" rle="{runs}" left="{left}" top="{top}" '
                     f'width="{mask_width}" height="{mask_height}" z_order="0"></mask>\n'
                 )
-        if perception.boxes is not None:
-            for box, score, class_id in zip(
-                perception.boxes.xyxy, perception.boxes.confidence, perception.boxes.class_id, strict=True
-            ):
-                write(
-                    f'    <box label={quoteattr(perception.class_names[class_id])} source="auto" occluded="0" '
-                    f'{_corners(box)} z_order="1">{_confidence(float(score))}</box>\n'
-                )
+        for found in objects(perception):
+            write(
+                f'    <box label={quoteattr(found.name)} source="auto" occluded="0" '
+                f'{_corners(found.corners)} z_order="1">{_confidence(found.confidence)}</box>\n'
+            )
         for _, points in polylines(road):
             write(
                 f'    <polyline label="{_LINE}" source="auto" occluded="0" points="{_points(points)}" '
@@ -219,14 +216,10 @@ class _VideoFile:
         for identity, points in polylines(road):
             track = self._tracks.setdefault((_LINE, identity), _Track(_LINE, "polyline"))
             track.shapes[frame] = (f'points="{_points(points)}"', "")
-        boxes = perception.boxes
-        for index in range(0 if boxes is None else len(boxes)):
-            assert boxes is not None
-            label = perception.class_names[boxes.class_id[index]]
-            identity = -1 if boxes.track_id is None else int(boxes.track_id[index])
-            key: object = ("box", label, identity) if identity >= 0 else ("box", frame, index)
-            track = self._tracks.setdefault(key, _Track(label, "box"))
-            track.shapes[frame] = (_corners(boxes.xyxy[index]), _confidence(float(boxes.confidence[index])))
+        for index, found in enumerate(objects(perception)):
+            key = ("box", found.name, found.track_id) if found.track_id >= 0 else ("box", frame, index)
+            track = self._tracks.setdefault(key, _Track(found.name, "box"))
+            track.shapes[frame] = (_corners(found.corners), _confidence(found.confidence))
 
     def dump(self, handle: IO[str]) -> None:
         height, width = self._first.size

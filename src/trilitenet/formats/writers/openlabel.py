@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.formats.writers.base import JsonStream, Writer, dumps, polylines, rounded
+from trilitenet.formats.writers.base import JsonStream, Writer, dumps, objects, polylines, rounded
 from trilitenet.processing.boxes import xyxy_to_cxcywh
 from trilitenet.structures import Perception
 
@@ -76,30 +76,26 @@ class _Document:
     def add(self, perception: Perception, road: Mapping[str, Any] | None) -> None:
         frame = perception.frame or 0
         self._frames.append(frame)
-        objects: dict[str, Any] = {}
+        data: dict[str, Any] = {}
         for uid, task, label in _MASKS:
             mask = getattr(perception, task)
             if mask is not None:
                 self._register(uid, frame, label, label)
-                objects[uid] = {"object_data": {"image": [_image("mask", mask)]}}
-        boxes = perception.boxes
-        for index in range(0 if boxes is None else len(boxes)):
-            assert boxes is not None
-            track_id = -1 if boxes.track_id is None else int(boxes.track_id[index])
-            uid = self._uid(("box", track_id) if track_id >= 0 else None)
-            kind = perception.class_names[boxes.class_id[index]]
-            self._register(uid, frame, f"{kind} {uid}", kind)
-            confidence = {"name": "confidence", "val": round(float(boxes.confidence[index]), 4)}
-            value = list(rounded(xyxy_to_cxcywh(boxes.xyxy[index])))
+                data[uid] = {"object_data": {"image": [_image("mask", mask)]}}
+        for found in objects(perception):
+            uid = self._uid(("box", found.track_id) if found.track_id >= 0 else None)
+            self._register(uid, frame, f"{found.name} {uid}", found.name)
+            confidence = {"name": "confidence", "val": round(found.confidence, 4)}
+            value = list(rounded(xyxy_to_cxcywh(found.corners)))
             box = {"name": "box", "val": value, "attributes": {"num": [confidence]}}
-            objects[uid] = {"object_data": {"bbox": [box]}}
+            data[uid] = {"object_data": {"bbox": [box]}}
         for identity, points in polylines(road):
             uid = self._uid(("line", identity))
             self._register(uid, frame, f"lane line {identity}", "lane line")
             flat = [value for point in points for value in point]
             line = {"name": "curve", "val": flat, "mode": "MODE_POLY2D_ABSOLUTE", "closed": False}
-            objects[uid] = {"object_data": {"poly2d": [line]}}
-        content: dict[str, Any] = {"objects": objects}
+            data[uid] = {"object_data": {"poly2d": [line]}}
+        content: dict[str, Any] = {"objects": data}
         figures = _figures(road)
         if figures:
             content["contexts"] = {"0": {"context_data": {"num": figures}}}
@@ -109,10 +105,8 @@ class _Document:
         self.stream.add(content, key=str(frame))
 
     def close(self) -> None:
-        objects = {
-            uid: {**named, "frame_intervals": _intervals(self._seen[uid])} for uid, named in self._objects.items()
-        }
-        tail: dict[str, Any] = {"objects": objects}
+        named = {uid: {**item, "frame_intervals": _intervals(self._seen[uid])} for uid, item in self._objects.items()}
+        tail: dict[str, Any] = {"objects": named}
         if self._context:
             context = {"name": "road", "type": "road", "frame_intervals": _intervals(self._context)}
             tail["contexts"] = {"0": context}

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from trilitenet.formats.writers.base import JsonStream, Writer, dumps, polylines, rounded
+from trilitenet.formats.writers.base import JsonStream, Writer, dumps, objects, polylines, rounded
 from trilitenet.processing.serialise import encode_mask
 from trilitenet.structures import Perception
 
@@ -64,23 +64,17 @@ class ScalabelWriter(Writer):
         self._stream = None
 
     def _boxes(self, perception: Perception) -> list[dict[str, Any]]:
-        boxes = perception.boxes
-        labels = []
-        for index in range(0 if boxes is None else len(boxes)):
-            assert boxes is not None
-            tracked = boxes.track_id is not None and boxes.track_id[index] >= 0
-            identity = f"track-{boxes.track_id[index]}" if boxes.track_id is not None and tracked else self._identity()
-            labels.append(
-                {
-                    "id": identity,
-                    "category": perception.class_names[boxes.class_id[index]],
-                    "score": round(float(boxes.confidence[index]), 4),
-                    "manualShape": False,
-                    "manualAttributes": False,
-                    "box2d": dict(zip(("x1", "y1", "x2", "y2"), rounded(boxes.xyxy[index]), strict=True)),
-                }
-            )
-        return labels
+        return [
+            {
+                "id": f"track-{found.track_id}" if found.track_id >= 0 else self._identity(),
+                "category": found.name,
+                "score": round(found.confidence, 4),
+                "manualShape": False,
+                "manualAttributes": False,
+                "box2d": dict(zip(("x1", "y1", "x2", "y2"), rounded(found.corners), strict=True)),
+            }
+            for found in objects(perception)
+        ]
 
     def _masks(self, perception: Perception) -> list[dict[str, Any]]:
         return [

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from trilitenet.errors import import_extra, part_of
-from trilitenet.formats.writers.base import GrowingFile, Writer, rounded
+from trilitenet.formats.writers.base import GrowingFile, Writer, objects, rounded
 from trilitenet.processing.serialise import encode_mask
 from trilitenet.structures import SCHEMA_VERSION, Perception
 
@@ -82,20 +82,14 @@ def _value(estimate: Mapping[str, float] | None) -> float | None:
 
 def box_rows(perception: Perception) -> list[dict[str, Any]]:
     """Return a row an object, best first; ``track_id`` is None where the identity is unknown."""
-    boxes = perception.boxes
-    if boxes is None:
-        return []
-    tracks = [-1] * len(boxes) if boxes.track_id is None else boxes.track_id.tolist()
     return [
         {
-            "class_name": perception.class_names[class_id],
-            "track_id": track if track >= 0 else None,
-            "confidence": round(score, 4),
-            **dict(zip(("left", "top", "right", "bottom"), rounded(corners), strict=True)),
+            "class_name": found.name,
+            "track_id": found.track_id if found.track_id >= 0 else None,
+            "confidence": round(found.confidence, 4),
+            **dict(zip(("left", "top", "right", "bottom"), rounded(found.corners), strict=True)),
         }
-        for corners, score, class_id, track in zip(
-            boxes.xyxy.tolist(), boxes.confidence.tolist(), boxes.class_id.tolist(), tracks, strict=True
-        )
+        for found in objects(perception)
     ]
 
 
