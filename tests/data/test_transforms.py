@@ -16,7 +16,6 @@ from trilitenet.data.transforms import (
     EvalTransform,
     TrainTransform,
     draw_affine,
-    flip,
     hsv,
     kept_boxes,
     mixup,
@@ -198,24 +197,10 @@ def test_nothing_is_letterbox() -> None:
     np.testing.assert_allclose(train.boxes, fitted.boxes, atol=1e-4)
 
 
-def test_flip_twice_is_nothing() -> None:
-    sample = marked(at=(0.2, 0.5))
-    there = flip(sample)
-    check_together(there, tolerance=1e-3)
-    back = flip(there)
-    np.testing.assert_array_equal(back.image, sample.image)
-    assert there.boxes is not None
-    assert back.boxes is not None
-    assert sample.boxes is not None
-    np.testing.assert_allclose(there.boxes[0, [0, 2]], 640 - sample.boxes[0, [2, 0]])
-    np.testing.assert_array_equal(back.boxes, sample.boxes)
-
-
 def test_unlabelled_stays_unlabelled() -> None:
     bare = Sample("bare", np.zeros((100, 200, 3), np.uint8))
     steps: list[Callable[[Sample], Sample]] = [
         EvalTransform(CANVAS),
-        flip,
         lambda sample: TrainTransform(CANVAS)(sample, np.random.default_rng(0)),
         lambda sample: TrainTransform(CANVAS, Augmentation(mosaic=1, mixup=1))(
             sample, np.random.default_rng(0), lambda _: bare

@@ -32,7 +32,6 @@ __all__ = [
     "TrainTransform",
     "Transform",
     "draw_affine",
-    "flip",
     "hsv",
     "kept_boxes",
     "mixup",
@@ -207,20 +206,6 @@ def warp(sample: Sample, affine: Affine, canvas: tuple[int, int], mask_above: in
         valid=_still_valid(moved.get("valid")),
         drivable_valid=_still_valid(moved.get("drivable_valid")),
         lane_valid=_still_valid(moved.get("lane_valid")),
-    )
-
-
-def flip(sample: Sample) -> Sample:
-    """Mirror a sample left and right."""
-    width = sample.image.shape[1]
-    return dataclasses.replace(
-        sample,
-        image=np.ascontiguousarray(sample.image[:, ::-1]),
-        boxes=None if sample.boxes is None else _mirror(sample.boxes, width),
-        ignored=_mirror(sample.ignored, width),
-        drivable=None if sample.drivable is None else np.ascontiguousarray(sample.drivable[:, ::-1]),
-        lane=None if sample.lane is None else np.ascontiguousarray(sample.lane[:, ::-1]),
-        **sample.change_valid(lambda valid: np.ascontiguousarray(valid[:, ::-1])),
     )
 
 
@@ -566,10 +551,3 @@ def _move_boxes(
     else:
         keep = (clipped[:, 2] > clipped[:, 0]) & (clipped[:, 3] > clipped[:, 1])
     return clipped[keep], keep
-
-
-def _mirror(boxes: NDArray[np.float32], width: int) -> NDArray[np.float32]:
-    mirrored: NDArray[np.float32] = boxes.copy()
-    mirrored[:, 0] = width - boxes[:, 2]
-    mirrored[:, 2] = width - boxes[:, 0]
-    return mirrored
