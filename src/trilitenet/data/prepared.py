@@ -43,7 +43,7 @@ from trilitenet.data.reading import (
     SampleSource,
     decode_image,
 )
-from trilitenet.data.sample import VALID, Sample
+from trilitenet.data.sample import BOXES, MASKS, VALID, Sample
 from trilitenet.errors import ConfigError, DataError, OutputError, import_extra, replacing, writing
 from trilitenet.processing.cores import ProcessPool
 from trilitenet.processing.letterbox import Letterbox
@@ -60,7 +60,6 @@ FORMAT: Final = 1
 _LAYOUT: Final = 2
 """Shards of another layout are written anew: those of 1 had one mask of validity for both tasks."""
 
-_MASKS: Final = ("drivable", "lane", *VALID)
 _ENTRY: Final = frozenset({"name", "size", "boxes", "class_id", "ignored", "attributes", "parts"})
 """What every line of an index holds."""
 
@@ -93,17 +92,12 @@ def shrink(sample: Sample, canvas: tuple[int, int], mask_above: int = 1) -> Samp
     bare = dataclasses.replace(box, canvas=box.resized, top=0, left=0)
     factor = np.array([width / sample.size[1], height / sample.size[0]] * 2)
 
-    def mask(values: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:
-        return None if values is None else bare.mask(values.view(np.bool_), mask_above)
-
     return dataclasses.replace(
         sample,
         image=bare.image(sample.image),
-        boxes=None if sample.boxes is None else (sample.boxes * factor).astype(np.float32),
-        ignored=(sample.ignored * factor).astype(np.float32),
-        drivable=mask(sample.drivable),
-        lane=mask(sample.lane),
-        **sample.change_valid(lambda valid: bare.mask(~valid) == 0),
+        **sample.changed(BOXES, lambda boxes: (boxes * factor).astype(np.float32)),
+        **sample.changed(MASKS, lambda mask: bare.mask(mask.view(np.bool_), mask_above)),
+        **sample.changed(VALID, lambda valid: bare.mask(~valid) == 0),
     )
 
 
@@ -355,9 +349,9 @@ class PreparedDataset:
         else:
             image = decode_image(parts["jpg"], entry["name"])
         masks: dict[str, NDArray[np.uint8] | None] = {}
-        for key in _MASKS:
+        for key in (*MASKS, *VALID):
             packed = parts.get(f"{key}.npy")
-            if packed is None or (key in ("drivable", "lane") and self._tasks is not None and key not in self._tasks):
+            if packed is None or (key in MASKS and self._tasks is not None and key not in self._tasks):
                 masks[key] = None
             else:
                 masks[key] = np.unpackbits(packed.reshape(height, -1), axis=1, count=width)
@@ -502,7 +496,7 @@ def _encode(sample: Sample, plan: _Plan) -> tuple[dict[str, bytes], dict[str, An
     else:
         bgr = cv2.cvtColor(sample.image, cv2.COLOR_RGB2BGR)
         members["jpg"] = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, plan.quality])[1].tobytes()
-    for key in _MASKS:
+    for key in (*MASKS, *VALID):
         mask = getattr(sample, key)
         if mask is not None:
             members[f"{key}.npy"] = _npy(np.packbits(mask, axis=1))

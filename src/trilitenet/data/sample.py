@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -11,8 +11,12 @@ from numpy.typing import NDArray
 
 from trilitenet.errors import ShapeError
 
-__all__ = ["VALID", "Sample"]
+__all__ = ["BOXES", "MASKS", "VALID", "Sample"]
 
+BOXES: Final = ("boxes", "ignored")
+"""The fields of a sample that hold boxes."""
+MASKS: Final = ("drivable", "lane")
+"""The fields of a sample that hold masks."""
 VALID: Final = ("valid", "drivable_valid", "lane_valid")
 """The fields of a sample that say where masks count."""
 
@@ -68,7 +72,7 @@ class Sample:
                 )
         if self.ignored.ndim != 2 or self.ignored.shape[1] != 4:
             raise ShapeError(f"{self.name}: ignored must be (M, 4), got {self.ignored.shape}")
-        for field in ("drivable", "lane", *VALID):
+        for field in (*MASKS, *VALID):
             dtype = np.bool_ if field in VALID else np.uint8
             mask = getattr(self, field)
             if mask is not None and (mask.shape != self.size or mask.dtype != dtype):
@@ -83,10 +87,9 @@ class Sample:
             return own if self.valid is None else self.valid
         return self.valid & own
 
-    def change_valid(self, change: Callable[[NDArray[np.bool_]], Any]) -> dict[str, Any]:
-        """Return the fields of `VALID` by name, those that are there changed."""
-        fields = {name: getattr(self, name) for name in VALID}
-        return {name: None if valid is None else change(valid) for name, valid in fields.items()}
+    def changed(self, fields: Iterable[str], change: Callable[[NDArray[Any]], Any]) -> dict[str, Any]:
+        """Return some fields by name, those that are there changed."""
+        return {name: None if (value := getattr(self, name)) is None else change(value) for name in fields}
 
     @property
     def size(self) -> tuple[int, int]:

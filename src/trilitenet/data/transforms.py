@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import check_size
 from trilitenet.data import photometric
-from trilitenet.data.sample import VALID, Sample
+from trilitenet.data.sample import BOXES, MASKS, VALID, Sample
 from trilitenet.errors import ConfigError
 from trilitenet.processing.boxes import clip_boxes
 from trilitenet.processing.letterbox import PAD_VALUE, Letterbox
@@ -175,21 +175,16 @@ def warp(sample: Sample, affine: Affine, canvas: tuple[int, int], mask_above: in
     box = Letterbox.fit(sample.size, canvas=canvas)
     matrix = affine.matrix(box)
     masks = {
-        "drivable": sample.drivable,
-        "lane": sample.lane,
+        **sample.changed(MASKS, lambda mask: _resize_mask(mask, box, mask_above)),
         # What comes from outside the image is not the own car: its mask is warped, and padded with 0.
-        **sample.change_valid(lambda valid: (~valid).view(np.uint8)),
+        **sample.changed(VALID, lambda valid: _resize_mask((~valid).view(np.uint8), box, 1)),
     }
-    image, moved = _warp_together(
-        _resize(sample.image, box),
-        {
-            name: _resize_mask(mask, box, 1 if name in VALID else mask_above)
-            for name, mask in masks.items()
-            if mask is not None
-        },
-        matrix,
-        canvas,
-    )
+    there = {name: mask for name, mask in masks.items() if mask is not None}
+    image, moved = _warp_together(_resize(sample.image, box), there, matrix, canvas)
+    whole: dict[str, Any] = {
+        name: grey <= 1 if name in VALID else cv2.threshold(grey, mask_above, 1, cv2.THRESH_BINARY)[1]
+        for name, grey in moved.items()
+    }
     boxes, class_id = sample.boxes, sample.class_id
     if boxes is not None and class_id is not None:
         boxes, keep = _move_boxes(boxes, box, matrix, affine.scale, strict=True)
@@ -201,11 +196,7 @@ def warp(sample: Sample, affine: Affine, canvas: tuple[int, int], mask_above: in
         boxes=boxes,
         class_id=class_id,
         ignored=ignored,
-        drivable=_binary(moved.get("drivable"), mask_above),
-        lane=_binary(moved.get("lane"), mask_above),
-        valid=_still_valid(moved.get("valid")),
-        drivable_valid=_still_valid(moved.get("drivable_valid")),
-        lane_valid=_still_valid(moved.get("lane_valid")),
+        **whole,
     )
 
 
@@ -289,12 +280,10 @@ class EvalTransform:
         return dataclasses.replace(
             sample,
             image=box.image(sample.image),
-            boxes=None if sample.boxes is None else box.boxes(sample.boxes),
-            ignored=box.boxes(sample.ignored),
-            drivable=None if sample.drivable is None else box.mask(sample.drivable.view(np.bool_)),
-            lane=None if sample.lane is None else box.mask(sample.lane.view(np.bool_)),
+            **sample.changed(BOXES, box.boxes),
+            **sample.changed(MASKS, lambda mask: box.mask(mask.view(np.bool_))),
             # What is outside the image is not the own car, so the padding stays valid.
-            **sample.change_valid(lambda valid: box.mask(~valid) == 0),
+            **sample.changed(VALID, lambda valid: box.mask(~valid) == 0),
         )
 
 
@@ -394,11 +383,7 @@ def mosaic(tiles: Sequence[Sample], rng: np.random.Generator) -> Sample:
         if first.class_id is None
         else np.concatenate([part.class_id for part in parts if part.class_id is not None]),
         ignored=shifted([part.ignored for part in parts]),
-        drivable=joined("drivable"),
-        lane=joined("lane"),
-        valid=joined("valid"),
-        drivable_valid=joined("drivable_valid"),
-        lane_valid=joined("lane_valid"),
+        **{name: joined(name) for name in (*MASKS, *VALID)},
     )
 
 
@@ -460,9 +445,7 @@ def _crop(sample: Sample, top: int, left: int, height: int, width: int) -> Sampl
         boxes=boxes,
         class_id=class_id,
         ignored=ignored,
-        drivable=None if sample.drivable is None else sample.drivable[area],
-        lane=None if sample.lane is None else sample.lane[area],
-        **sample.change_valid(lambda valid: valid[area]),
+        **sample.changed((*MASKS, *VALID), lambda mask: mask[area]),
     )
 
 
@@ -511,14 +494,6 @@ def _warp_together(
     if names:
         moved[names[0]] = cv2.extractChannel(whole, 3)
     return cv2.cvtColor(whole, cv2.COLOR_RGBA2RGB), moved
-
-
-def _binary(grey: NDArray[np.uint8] | None, above: int) -> NDArray[np.uint8] | None:
-    return None if grey is None else cv2.threshold(grey, above, 1, cv2.THRESH_BINARY)[1]
-
-
-def _still_valid(outside: NDArray[np.uint8] | None) -> NDArray[np.bool_] | None:
-    return None if outside is None else outside <= 1
 
 
 def _move_boxes(
