@@ -357,10 +357,7 @@ def _squared(apart: Floats, covariance: Floats) -> float:
 
 def _lane_at(centre: GroundCurve, x: float) -> float:
     """Return y of the lane's middle; beyond what was seen it goes on straight."""
-    inside = min(max(x, 0.0), centre.end)
-    _, c1, c2, c3 = centre.polynomial
-    slope = c1 + inside * (2 * c2 + inside * 3 * c3)
-    return float(centre.at(inside) + slope * (x - inside))
+    return centre.tangent(min(max(x, 0.0), centre.end), x)
 
 
 def find_lead(boxes: Boxes, fit: LaneFit, camera: Camera, errors: CameraErrors) -> LeadVehicle | None:

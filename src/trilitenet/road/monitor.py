@@ -173,9 +173,5 @@ def _metres_right(line: LaneLine) -> float | None:
     """Return how many metres right of the vehicle the line passes it; None if it is only seen far away."""
     if line.ground is None or line.ground.start > 25 or line.confidence < 0.3:
         return None
-    near = min(max(line.ground.start, 3.0), line.ground.end)
-    value = float(line.ground.at(near))
-    c1, c2, c3 = line.ground.polynomial[1:].tolist()
-    slope = c1 + near * (2 * c2 + near * 3 * c3)
-    value -= slope * near
+    value = line.ground.tangent(min(max(line.ground.start, 3.0), line.ground.end), 0.0)
     return -value if math.isfinite(value) and abs(value) < 40 else None

@@ -60,6 +60,11 @@ class GroundCurve:
         c0, c1, c2, c3 = self.polynomial
         return c0 + x * (c1 + x * (c2 + x * c3))
 
+    def tangent(self, touch: float, x: float) -> float:
+        """Return y in metres at x in metres of the straight line that touches the curve at x = ``touch``."""
+        c1, c2, c3 = self.polynomial[1:].tolist()
+        return float(self.at(touch) + (c1 + touch * (2 * c2 + touch * 3 * c3)) * (x - touch))
+
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form."""
         return {
