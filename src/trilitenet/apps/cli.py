@@ -141,7 +141,7 @@ def _converted(type_: Any, tokens: Sequence[cyclopts.Token]) -> Any:
 _LISTS: Final = {
     "--backend": "auto|torch|onnxruntime|openvino|tensorrt|ncnn",
     "--batch": r"\d+",
-    "--by": "timeofday|weather|scene",
+    "--by": r"(?!(tiny|small|base)$)[^-./\\][^./\\]*",
     "--card": r".+\.ya?ml",
     "--classes": r"[^-./\\][^./\\]*",
     "--format": "json|jsonl|scalabel|openlabel|coco|yolo|cvat|parquet|csv",
@@ -165,7 +165,7 @@ def _repeated(words: Sequence[str]) -> list[str]:
     option = ""
     for word in words:
         further = bool(option) and re.fullmatch(_LISTS[option], word) is not None
-        if option == "--classes" and os.access(word, os.F_OK):  # any word may be the name of a class
+        if option in {"--by", "--classes"} and os.access(word, os.F_OK):  # any word may be an attribute or a class
             further = False
         if further and spread[-1] != option:
             spread.append(option)
