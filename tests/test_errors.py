@@ -125,6 +125,7 @@ def test_what_is_told_already_is_not_told_again(tmp_path: Path) -> None:
 
 
 def test_dashes_make_no_two_options_alike() -> None:
+    assert did_you_mean("--bgr", []) == ""
     assert did_you_mean("--bgr", ["--nms", "--lane", "--mask-scale"]).startswith("; known: ")
     assert did_you_mean("--lanes", ["--nms", "--lane"]) == "; did you mean '--lane'?"
     assert did_you_mean("--io", ["--iou", "--lane"]) == "; did you mean '--iou'?"

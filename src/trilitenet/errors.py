@@ -118,11 +118,13 @@ def shown(value: object) -> str:
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return ``"; did you mean 'x'?"`` for the nearest known word, or the list of what is known."""
+    """Return ``"; did you mean 'x'?"`` for the nearest known word, or the list of what is known, if anything is."""
     # Compared without an option's dashes, which would make any two options alike.
     names = {name.lstrip("-"): name for name in sorted(known)}
     near = difflib.get_close_matches(word.lstrip("-"), names, n=1)
-    return f"; did you mean {names[near[0]]!r}?" if near else f"; known: {', '.join(names.values())}"
+    if near:
+        return f"; did you mean {names[near[0]]!r}?"
+    return f"; known: {', '.join(names.values())}" if names else ""
 
 
 def import_extra(module: str, extra: str) -> ModuleType:

@@ -111,6 +111,12 @@ def test_an_attribute_that_is_named_twice_has_one_table() -> None:
     assert [(row.value, row.images) for row in report.conditions] == [("daytime", 9), ("night", 3)]
 
 
+def test_an_attribute_that_no_image_has_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    evaluate(fake_predictor(Images()), Images(), resamples=0, by=("timeofday", "weather", "timofday"))
+    message = "no image has the attribute 'timofday' to make a table by; did you mean 'timeofday'?"
+    assert [record.message for record in caplog.records] == [message]
+
+
 def test_the_worst_images_are_kept_with_a_picture() -> None:
     images = Images()
     report = evaluate(fake_predictor(images, drift=4), images, resamples=0, worst=3)

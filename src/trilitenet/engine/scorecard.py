@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import heapq
 import itertools
+import logging
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -15,12 +16,14 @@ from trilitenet.config import TASKS, Task, Thresholds
 from trilitenet.engine.overlays import error_overlay, shrunken
 from trilitenet.engine.report import Condition, DetectionPlots, Figure, Provenance, Report, WorstFrame
 from trilitenet.engine.scoring import CanvasPrediction, FairMetrics, ImageOutcome, LabelledImage, PaperMetrics
-from trilitenet.errors import ConfigError, DataError
+from trilitenet.errors import ConfigError, DataError, did_you_mean
 from trilitenet.metrics.bootstrap import bootstrap, interval
 from trilitenet.metrics.detection import DetectionMetric
 from trilitenet.structures import Perception
 
 __all__ = ["CONDITIONS", "PAPER_THRESHOLDS", "PROTOCOLS", "Scorecard"]
+
+_LOGGER: Final = logging.getLogger(__name__)
 
 PROTOCOLS: Final = ("paper", "fair", "both")
 CONDITIONS: Final = ("timeofday", "weather", "scene")
@@ -70,6 +73,7 @@ class Scorecard:
         self._by = tuple(dict.fromkeys(by))
         self._names: list[str] = []
         self._values: dict[str, list[str]] = {attribute: [] for attribute in self._by}
+        self._known: set[str] = set()
         self._worst: dict[Task, list[tuple[float, int, int, WorstFrame]]] = {task: [] for task in self.tasks}
         self._serial = itertools.count()
 
@@ -82,6 +86,7 @@ class Scorecard:
             canvas: For the 'paper' protocol.
         """
         self._names.append(sample.name)
+        self._known |= sample.attributes.keys()
         for attribute in self._by:
             self._values[attribute].append(sample.attributes.get(attribute, "") or "undefined")
         if self.fair is not None and prediction is not None:
@@ -175,6 +180,9 @@ class Scorecard:
         for attribute, values in self._values.items():
             counts = collections.Counter(values)
             if set(counts) == {"undefined"}:
+                if attribute not in CONDITIONS:
+                    hint = did_you_mean(attribute, self._known)
+                    _LOGGER.warning("no image has the attribute %r to make a table by%s", attribute, hint)
                 continue
             rows += [
                 (attribute, value, [int(one == value) for one in values])
