@@ -60,7 +60,7 @@ class RoadOptions:
     """What is wanted beyond the single frame.
 
     Attributes:
-        measure: Lanes as curves, and, with a camera, metres.
+        measure: Lanes as curves, and, with a camera, metres; done with a camera file in any case.
         camera: A camera file (see `trilitenet.road.camera.read_camera`); estimated from the lanes if None.
         track: Give vehicles identities.
         smoothing: Weight of the past in the masks, in [0, 1).
@@ -199,7 +199,8 @@ def predict(
         quiet: Show no progress.
         road: Make curves of the lane lines and measure the road in metres: offset, heading, curvature, the vehicle
             ahead, lane departure and collision warnings (advisory only).
-        camera: Camera file (YAML) for --road; without it, the camera is estimated from the lanes of a video.
+        camera: Camera file (YAML) for --road, which it turns on; without it, the camera is estimated from the lanes of
+            a video.
         track: Give vehicles an identity over the frames of a video.
         smoothing: Weight of the past in a video's masks, from 0 (none) to below 1.
 
