@@ -19,6 +19,8 @@ def test_synthesize_writes_the_published_layout(tmp_path: Path, capsys: pytest.C
         assert len(list((tmp_path / "out" / folder / "val").glob(f"*.{ending}"))) == 2
     assert main(words) == 1
     assert "not empty" in capsys.readouterr().err
+    assert {path.stem for path in (tmp_path / "out/images/val").iterdir()} == {f"synthetic_5_00000{i}" for i in (0, 1)}
+    assert "5" not in (tmp_path / "out/dataset.yaml").read_text()  # which other splits, of other seeds, have too
 
 
 @pytest.mark.parametrize(
