@@ -16,7 +16,7 @@ from starlette.testclient import TestClient
 
 from tests.apps.server.conftest import MakeApp, Running, encode, picture
 from trilitenet.apps.server.application import Application
-from trilitenet.apps.server.inference_protocol import _boxes, _parse
+from trilitenet.apps.server.inference_protocol import _base64, _boxes, _parse
 from trilitenet.apps.server.problems import ProblemError
 from trilitenet.apps.server.settings import Settings
 from trilitenet.structures import Boxes, Perception
@@ -232,6 +232,13 @@ def test_numbers_are_parsed_while_others_get_their_turn(value: bytes) -> None:
 
     # The best of five, because other work on the machine makes pauses too.
     assert min(_longest_pause(parse) for _ in range(5)) < 0.25
+
+
+def test_base64_is_decoded_while_others_get_their_turn() -> None:
+    image = bytes(range(256)) * 32_768
+    texts = [base64.b64encode(image).decode()]
+    assert _base64(texts) == [image]
+    assert min(_longest_pause(lambda: _base64(texts)) for _ in range(5)) < 0.5
 
 
 def test_pixels_as_numbers_fit_up_to_640_x_480(client: TestClient) -> None:

@@ -52,7 +52,7 @@ _MAX_DIGITS: Final = 20
 _NO_PIXELS: Final = "data must hold whole numbers from 0 to 255"
 
 _SLICE: Final = 2**16
-"""Numbers that are checked at once: between two slices other threads get their turn."""
+"""Numbers that are checked, or letters of base64 decoded, at once: between two slices other threads get their turn."""
 
 _MAX_MASK_PIXELS: Final = 4_000_000
 """Pixels of all images of a request whose masks are wanted as JSON."""
@@ -112,7 +112,7 @@ def protocol_router(service: Service) -> APIRouter:
         reservation = request.scope["state"]["reservation"]
         body = await read_request(request, service, reservation)
         split = _json_length(request.headers.get(_HEADER_LENGTH), len(body))
-        reservation.take(_json_memory(body, split))
+        reservation.take(await service.in_pool(_json_memory, body, split))
 
         async def work(deadline: float) -> Response:
             query = await service.in_pool(_parse, body, split, names, service.settings)
@@ -348,7 +348,10 @@ def _base64(data: Any) -> list[bytes]:
     if not isinstance(data, list) or not all(isinstance(item, str) for item in data):
         raise _bad("data must be a list of encoded images in base64")
     try:
-        return [base64.b64decode(item, validate=True) for item in data]
+        return [
+            b"".join(base64.b64decode(item[i : i + _SLICE], validate=True) for i in range(0, len(item), _SLICE))
+            for item in data
+        ]
     except (binascii.Error, ValueError) as error:
         raise _bad("data is not base64") from error
 
