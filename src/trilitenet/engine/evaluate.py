@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import ModelCard, Task, Thresholds
+from trilitenet.config import ModelCard, Thresholds
 from trilitenet.engine.predictions import SavedPredictions
 from trilitenet.engine.provenance import describe_hardware, describe_versions, peak_memory
 from trilitenet.engine.report import SAVED, Provenance, Report
@@ -438,7 +438,7 @@ def best_thresholds(
     check_classes(card, dataset)
     low = dataclasses.replace(predictor.thresholds, confidence=LOWEST_CONFIDENCE)
     detection = DetectionMetric(card.class_names)
-    counts: dict[Task, NDArray[np.int64]] = {
+    counts: dict[Literal["drivable", "lane"], NDArray[np.int64]] = {
         "drivable": np.zeros((2, 256), np.int64),
         "lane": np.zeros((2, 256), np.int64),
     }
@@ -446,11 +446,8 @@ def best_thresholds(
     def look(sample: LabelledImage, raw: RawOutputs, index: int, letterbox: Letterbox) -> None:
         if raw.detection is not None:
             add_boxes(detection, sample, select_boxes(raw.detection[index], letterbox, low))
-        pairs: tuple[tuple[Literal["drivable", "lane"], NDArray[np.uint8] | None, NDArray[np.uint8] | None], ...] = (
-            ("drivable", raw.drivable, sample.drivable),
-            ("lane", raw.lane, sample.lane),
-        )
-        for task, masks, truth in pairs:
+        for task in counts:
+            masks, truth = getattr(raw, task), getattr(sample, task)
             if masks is not None and truth is not None:
                 probability = letterbox.mask_to_source(masks[index])
                 counts[task] += _probability_counts(probability, truth, sample.counted(task))
