@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Awaitable, Callable
 from importlib import resources
-from typing import Final, NamedTuple
+from typing import Final
 
 from fastapi import APIRouter, Request
 from starlette.responses import Response
@@ -28,20 +28,15 @@ _POLICY: Final = (
 )
 
 
-class _File(NamedTuple):
-    content: bytes
-    headers: dict[str, str]
-
-
 def pages_router() -> APIRouter:
     """Return the routes of the page's files."""
     router = APIRouter(include_in_schema=False)
     for path, (name, media_type) in _FILES.items():
-        router.add_api_route(path, _serve(_read(name, media_type)), methods=["GET"])
+        router.add_api_route(path, _serve(name, media_type), methods=["GET"])
     return router
 
 
-def _read(name: str, media_type: str) -> _File:
+def _serve(name: str, media_type: str) -> Callable[[Request], Awaitable[Response]]:
     content = resources.files(__package__).joinpath("page").joinpath(name).read_bytes()
     etag = f'"{hashlib.sha256(content).hexdigest()[:16]}"'
     headers = {
@@ -50,13 +45,10 @@ def _read(name: str, media_type: str) -> _File:
         "cache-control": "no-cache",
         "content-security-policy": _POLICY,
     }
-    return _File(content, headers)
 
-
-def _serve(file: _File) -> Callable[[Request], Awaitable[Response]]:
     async def page(request: Request) -> Response:
-        if file.headers["etag"] in request.headers.get("if-none-match", ""):  # one of a list, or marked W/ by a proxy
-            return Response(status_code=304, headers=file.headers)
-        return Response(file.content, headers=file.headers)
+        if etag in request.headers.get("if-none-match", ""):  # one of a list, or marked W/ by a proxy
+            return Response(status_code=304, headers=headers)
+        return Response(content, headers=headers)
 
     return page
