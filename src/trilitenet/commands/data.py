@@ -7,7 +7,7 @@ import dataclasses
 import io
 import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -76,16 +76,8 @@ class Converted:
     def summary(self) -> str:
         """Return what was found, written and left out, for people."""
         table = Table("split", "images", "detection", "drivable", "lane", "boxes", "markings")
-        for split, images in self.report.images.items():
-            labelled, boxes = self.report.labelled[split], self.report.objects[split]
-            lanes = self.report.lanes[split]
-            table.add_row(
-                split,
-                str(images),
-                *(str(labelled.get(task, 0)) for task in ("detection", "drivable", "lane")),
-                ", ".join(f"{count} {name}" for name, count in boxes.items()),
-                ", ".join(f"{count} {name}" for name, count in lanes.items()),
-            )
+        for split in self.report.images:
+            table.add_row(*_counts(self.report, split), _listed(self.report.lanes[split]))
         lines = [*self.found, _rendered(table)]
         for split, reasons in self.report.dropped.items():
             lines += [f"{split}: left out {count} x {reason}" for reason, count in reasons.items()]
@@ -194,14 +186,8 @@ class Checked:
         """Return tables of what is there and what is wrong, for people."""
         report = self.report
         counts = Table("split", "images", "detection", "drivable", "lane", "boxes")
-        for split, images in report.images.items():
-            labelled = report.labelled[split]
-            counts.add_row(
-                split,
-                str(images),
-                *(str(labelled.get(task, 0)) for task in ("detection", "drivable", "lane")),
-                ", ".join(f"{count} {name}" for name, count in report.objects[split].items()),
-            )
+        for split in report.images:
+            counts.add_row(*_counts(report, split))
         lines = [f"{report.root}: taken for {report.layout}", _rendered(counts)]
         few = {key: values for key, values in report.conditions.items() if len(values) <= 12}
         for key, values in few.items():
@@ -508,6 +494,16 @@ def _all_fitted(dataset: DrivingDataset, indices: Iterable[int], width: int) -> 
 def _workers(workers: int) -> int:
     count = workers or usable_cores()
     return 0 if count == 1 else count
+
+
+def _counts(report: ConversionReport | CheckReport, split: str) -> tuple[str, ...]:
+    """Return cells of a table: the split, its images, those labelled for each task, and boxes."""
+    labelled = (str(report.labelled[split].get(task, 0)) for task in ("detection", "drivable", "lane"))
+    return split, str(report.images[split]), *labelled, _listed(report.objects[split])
+
+
+def _listed(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in counts.items())
 
 
 def _rendered(table: Table) -> str:
