@@ -145,21 +145,23 @@ def _error(code: str, message: str) -> dict[str, Any]:
     return {"model": ErrorAnswer, "content": {"application/json": {"example": {"error": body}}}}
 
 
-_UNAUTHORIZED: Final = ("unauthorized", "this service needs a bearer token")
+_TOLD: Final = {
+    400: ("empty", "the image is empty"),
+    401: ("unauthorized", "this service needs a bearer token"),
+    403: ("cross_site", "another web site may not use this service through its visitors"),
+    408: ("upload_timeout", "the body did not arrive within 20 s"),
+    413: ("too_many_pixels", "the image has 60000 x 60000 pixels; send a smaller one"),
+    415: ("unsupported_type", "the bytes are not a JPEG, PNG or WebP image"),
+    422: ("broken_image", "the JPEG image is broken or truncated"),
+    500: ("internal", "the service failed on this request; its log says why"),
+    503: ("queue_full", "all 64 places are taken; try again in 1 s"),
+}
+"""Status -> code and message of a refusal."""
 
 _RETRY: Final = {"Retry-After": {"description": "Seconds to wait.", "schema": {"type": "integer"}}}
 
-_REFUSALS: Final[dict[int | str, dict[str, Any]]] = {
-    400: _error("empty", "the image is empty"),
-    401: _error(*_UNAUTHORIZED),
-    403: _error("cross_site", "another web site may not use this service through its visitors"),
-    408: _error("upload_timeout", "the body did not arrive within 20 s"),
-    413: _error("too_many_pixels", "the image has 60000 x 60000 pixels; send a smaller one"),
-    415: _error("unsupported_type", "the bytes are not a JPEG, PNG or WebP image"),
-    422: _error("broken_image", "the JPEG image is broken or truncated"),
-    500: _error("internal", "the service failed on this request; its log says why"),
-    503: {**_error("queue_full", "all 64 places are taken; try again in 1 s"), "headers": _RETRY},
-}
+_REFUSALS: Final[dict[int | str, dict[str, Any]]] = {status: _error(*told) for status, told in _TOLD.items()}
+_REFUSALS[503]["headers"] = _RETRY
 _FILE: Final = {"type": "string", "format": "binary"}
 
 
@@ -291,16 +293,11 @@ INFER: Final[dict[str, Any]] = {
             },
             "content": {**_OBJECT, "application/octet-stream": {"schema": _FILE}},
         },
+        **{status: _protocol_error(message) for status, (_, message) in _TOLD.items()},
         400: _protocol_error("shape must be a list of positive numbers"),
-        401: _protocol_error(_UNAUTHORIZED[1]),
-        403: _protocol_error("another web site may not use this service through its visitors"),
         404: _UNKNOWN,
-        408: _protocol_error("the body did not arrive within 20 s"),
         413: _protocol_error("at most 16 images are taken at once"),
-        415: _protocol_error("the bytes are not a JPEG, PNG or WebP image"),
-        422: _protocol_error("the JPEG image is broken or truncated"),
-        500: _protocol_error("the service failed on this request; its log says why"),
-        503: {**_protocol_error("all 64 places are taken; try again in 1 s"), "headers": _RETRY},
+        503: {**_protocol_error(_TOLD[503][1]), "headers": _RETRY},
     },
     "openapi_extra": {
         "requestBody": {
@@ -335,7 +332,7 @@ def add_token(schema: dict[str, Any], public: Container[str], *, required: bool)
             continue
         v2 = path.startswith("/v2")
         form = ProtocolErrorAnswer if v2 else ErrorAnswer
-        example = (_protocol_error(_UNAUTHORIZED[1]) if v2 else _error(*_UNAUTHORIZED))["content"]["application/json"]
+        example = (_protocol_error(_TOLD[401][1]) if v2 else _error(*_TOLD[401]))["content"]["application/json"]
         content = {"schema": {"$ref": f"#/components/schemas/{form.__name__}"}, **example}
         refusal = {"description": "Unauthorized", "content": {"application/json": content}}
         for operation in operations.values():
