@@ -173,9 +173,6 @@ class _Job:
     description: DatasetDescription
     table: dict[str, int]
 
-    def __call__(self, work: tuple[str, str]) -> _Facts:
-        return _look(self, *work)
-
 
 def detect_layout(root: str | Path) -> tuple[str, str]:
     """Return what a folder looks like.
@@ -296,7 +293,7 @@ def check_dataset(
         layout=words,
         images={split: len(items) for split, items in facts.items()},
         labelled={split: _sorted(Counter(t for f in items for t in f.labelled)) for split, items in facts.items()},
-        objects={split: _sorted(_sum(f.objects for f in items)) for split, items in facts.items()},
+        objects={split: _sorted(sum((Counter(f.objects) for f in items), Counter())) for split, items in facts.items()},
         conditions=_conditions(facts, index),
         sizes=_sorted(Counter(f"{f.size[1]}x{f.size[0]}" for items in facts.values() for f in items if f.size)),
         drivable=_means(facts, "drivable"),
@@ -338,15 +335,17 @@ class _Collector:
 
 
 def _run(job: _Job, work: list[tuple[str, str]], workers: int) -> Iterator[_Facts]:
+    look = functools.partial(_look, job)
     if workers <= 0 or len(work) < 64:
-        yield from map(job, work)
+        yield from map(look, work)
         return
     with ProcessPool(workers) as pool:
-        yield from pool.map(job, work, chunksize=64)
+        yield from pool.map(look, work, chunksize=64)
 
 
-def _look(job: _Job, split: str, file: str) -> _Facts:
-    """Read all that belongs to one image."""
+def _look(job: _Job, work: tuple[str, str]) -> _Facts:
+    """Read all that belongs to one image of a split."""
+    split, file = work
     name = Path(file).stem
     tasks = job.description.tasks
     faults: list[tuple[str, str]] = []
@@ -399,19 +398,8 @@ def _look_at_image(
     except BROKEN as error:
         faults.append(("image-unreadable", f"{where} ({_reason(error)})"))
         return None, digest, 0, b""
-    bits = _perceptual_hash(grey)
-    return size, digest, bits, grey.resize((16, 16), Image.Resampling.BOX).tobytes()
-
-
-def _perceptual_hash(grey: Image.Image) -> int:
-    bits = _phash()(grey).hash.reshape(-1)
-    return int.from_bytes(np.packbits(bits).tobytes(), "big")
-
-
-@functools.cache
-def _phash() -> Callable[[Image.Image], Any]:
-    function: Callable[[Image.Image], Any] = import_extra("imagehash", "data").phash
-    return function
+    bits = np.packbits(import_extra("imagehash", "data").phash(grey).hash).tobytes()
+    return size, digest, int.from_bytes(bits, "big"), grey.resize((16, 16), Image.Resampling.BOX).tobytes()
 
 
 def _look_at_boxes(
@@ -614,13 +602,6 @@ def _anchor_recall(sizes: NDArray[np.float32], anchors: Anchors, ratio: float = 
 def _means(facts: dict[str, list[_Facts]], task: str) -> dict[str, float]:
     parts = {split: [f.parts[task] for f in items if task in f.parts] for split, items in facts.items()}
     return {split: round(float(np.mean(values)), 5) for split, values in parts.items() if values}
-
-
-def _sum(counts: Iterable[dict[str, int]]) -> Counter[str]:
-    total: Counter[str] = Counter()
-    for one in counts:
-        total.update(one)
-    return total
 
 
 def _sorted(counts: Counter[str]) -> dict[str, int]:
