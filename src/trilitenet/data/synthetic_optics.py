@@ -1,20 +1,19 @@
-"""What a synthetic scene's pixels look at, the light there, and the noise that surfaces are made of."""
+"""What a synthetic scene's pixels look at, and the noise that surfaces are made of."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.data.synthetic_world import FAR, Colour, World
+from trilitenet.data.synthetic_world import FAR
 from trilitenet.processing.geometry import Camera
 
-__all__ = ["TILE", "Lighting", "Plane", "Sight", "ground_tile", "look_up", "noise", "rays", "sight_of"]
+__all__ = ["TILE", "Plane", "Sight", "ground_tile", "look_up", "noise", "rays", "sight_of"]
 
 Plane = NDArray[np.float32]
 
@@ -95,30 +94,3 @@ def sight_of(camera: Camera) -> Sight:
     x = np.clip(x, 0, FAR)
     y = np.clip(left[top:] * scale, -400, 400)
     return Sight(top, seen, x, y, (x * 4).astype(np.int32))
-
-
-class Lighting:
-    """Light and haze at any place."""
-
-    def __init__(self, world: World) -> None:
-        self.light = world.light
-
-    def tone(self, colour: Colour, x: float, y: float) -> tuple[float, float, float]:
-        """Return the colour that a surface at (x, y) metres shows."""
-        light = self.light
-        beam = 0.0
-        if light.headlights:
-            spread = y / (1.6 + 0.22 * max(x, 0.0))
-            beam = light.headlights * math.exp(-spread * spread) * math.exp(-max(x, 0.0) / 38.0) * 0.8
-        clear = math.exp(-light.haze * max(x, 0.0))
-        red, green, blue = (
-            min(255.0, c * (a + beam)) * clear + h * (1 - clear)
-            for c, a, h in zip(colour, light.ambient, light.horizon, strict=True)
-        )
-        return red, green, blue
-
-    def lamp_tone(self, colour: Colour, x: float) -> tuple[float, float, float]:
-        """As `tone`, for what shines by itself, ``x`` metres ahead."""
-        clear = math.exp(-self.light.haze * 0.5 * max(x, 0.0))
-        red, green, blue = (c * clear + h * (1 - clear) for c, h in zip(colour, self.light.horizon, strict=True))
-        return red, green, blue

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.data.synthetic_ground import draw_ground
-from trilitenet.data.synthetic_optics import Lighting, Plane, look_up, noise, rays
+from trilitenet.data.synthetic_optics import Plane, look_up, noise, rays
 from trilitenet.data.synthetic_scenery import draw_barrier, draw_item
 from trilitenet.data.synthetic_vehicles import Lamp, VehiclePose, draw_shadow, draw_vehicle
 from trilitenet.data.synthetic_weather import add_camera_faults, draw_bonnet, draw_glare, draw_rain, draw_reflections
@@ -64,11 +64,10 @@ def render(
     """
     camera = world.camera
     height, width = camera.size
-    lighting = Lighting(world)
     image = _draw_sky(world)
     ids = np.zeros((height, width), np.uint8)
     drivable, lines, paint = draw_ground(world, image)
-    poses, lit, lamps = _draw_objects(world, image, ids, lighting)
+    poses, lit, lamps = _draw_objects(world, image, ids)
     if world.light.wet:
         draw_reflections(world, image, ids)
     if lamps:
@@ -91,9 +90,8 @@ def _draw_sky(world: World) -> NDArray[np.uint8]:
     height, width = camera.size
     forward, left, up = rays(camera)
     limit = int(np.clip(camera.horizon([0, width - 1]).max() + 3, 2, height))
-    lighting = Lighting(world)
     image = np.empty((height, width, 3), np.uint8)
-    image[:] = np.clip(lighting.tone(world.layout.terrain, FAR, 50.0), 0, 255)
+    image[:] = np.clip(world.light.tone(world.layout.terrain, FAR, 50.0), 0, 255)
     # The air varies slowly: every second row and column is enough.
     air = _draw_air(world, *(plane[:limit:2, ::2] for plane in (forward, left, up)))
     image[:limit] = cv2.resize(air, (width, limit), interpolation=cv2.INTER_LINEAR)
@@ -102,7 +100,7 @@ def _draw_sky(world: World) -> NDArray[np.uint8]:
     if len(reached):
         top = int(reached[0])
         azimuth = np.arctan2(left[limit - 1], forward[limit - 1]) + world.bearing + world.texture % 100
-        _draw_skyline(world, image[top:limit], slope[top:], azimuth.astype(np.float32), lighting)
+        _draw_skyline(world, image[top:limit], slope[top:], azimuth.astype(np.float32))
     return image
 
 
@@ -131,7 +129,7 @@ def _draw_air(world: World, forward: Plane, left: Plane, up: Plane) -> NDArray[n
     return air
 
 
-def _draw_skyline(world: World, image: NDArray[np.uint8], slope: Plane, azimuth: Plane, lighting: Lighting) -> None:
+def _draw_skyline(world: World, image: NDArray[np.uint8], slope: Plane, azimuth: Plane) -> None:
     """Draw hills, then trees or houses, into the rows above the horizon.
 
     Args:
@@ -139,7 +137,6 @@ def _draw_skyline(world: World, image: NDArray[np.uint8], slope: Plane, azimuth:
         image: (h, W, 3) uint8, changed in place.
         slope: (h, W) tangent of each pixel's elevation.
         azimuth: (W,) direction of each column in radians.
-        lighting: Light and haze.
     """
     light = world.light
     planes = [plane.astype(np.float32) for plane in cv2.split(image)]
@@ -156,7 +153,7 @@ def _draw_skyline(world: World, image: NDArray[np.uint8], slope: Plane, azimuth:
             wave = look_up(noise(roughness, 2 + layer), azimuth[None] * scale, azimuth[None] * 3 + layer * 99)[0]
             line = tall * (0.62 + 0.22 * wave)
             colour = (84.0, 98.0, 92.0) if layer == 0 else (52.0, 64.0, 38.0)
-        shade = lighting.tone(colour, far if light.weather != "fog" else far * 0.6, 200.0)
+        shade = light.tone(colour, far if light.weather != "fog" else far * 0.6, 200.0)
         cover = np.clip((line.astype(np.float32)[None] - slope) * np.float32(world.camera.fy) + np.float32(0.5), 0, 1)
         bumps = np.float32(0.0)
         if layer == 1:
@@ -169,7 +166,7 @@ def _draw_skyline(world: World, image: NDArray[np.uint8], slope: Plane, azimuth:
 
 
 def _draw_objects(
-    world: World, image: NDArray[np.uint8], ids: NDArray[np.uint8], lighting: Lighting
+    world: World, image: NDArray[np.uint8], ids: NDArray[np.uint8]
 ) -> tuple[tuple[VehiclePose, ...], tuple[float, ...], list[Lamp]]:
     """Draw everything that stands on the ground, far to near; barriers after what is beyond them."""
     light, course = world.light, world.course
@@ -207,13 +204,13 @@ def _draw_objects(
             number = FIRST_VEHICLE + len(poses)
             draw_shadow(image, world.camera, thing, 0.75 if light.time != "night" else 0.5)
             lamps += draw_vehicle(
-                image, ids, number, world.camera, thing, lighting.tone, sun=sun, lamps=light.lamps, sky=sky
+                image, ids, number, world.camera, thing, light.tone, sun=sun, lamps=light.lamps, sky=sky
             )
             poses.append(thing)
-            bright = min(1.0, (lighting.tone((255.0, 255.0, 255.0), x, thing.y)[0] + 60 * light.lamps) / 90.0)
+            bright = min(1.0, (light.tone((255.0, 255.0, 255.0), x, thing.y)[0] + 60 * light.lamps) / 90.0)
             lit.append(math.exp(-light.haze * x) * bright)
         elif isinstance(thing, Barrier):
-            draw_barrier(world, thing, image, ids, lighting)
+            draw_barrier(world, thing, image, ids)
         else:
-            draw_item(world, thing, image, ids, lighting, lamps)
+            draw_item(world, thing, image, ids, lamps)
     return tuple(poses), tuple(lit), lamps

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.data.synthetic_optics import Lighting, noise
+from trilitenet.data.synthetic_optics import noise
 from trilitenet.data.synthetic_vehicles import SHIFT, Lamp, fixed
-from trilitenet.data.synthetic_world import FAR, Barrier, Colour, Item, World
+from trilitenet.data.synthetic_world import FAR, Barrier, Colour, Item, Light, World
 from trilitenet.processing.geometry import Camera
 
 __all__ = ["SCENERY", "draw_barrier", "draw_item", "fill"]
@@ -30,9 +30,7 @@ def fill(image: NDArray[np.uint8], ids: NDArray[np.uint8], pixels: NDArray[np.fl
     cv2.fillPoly(ids, [outline], SCENERY, cv2.LINE_8, SHIFT)
 
 
-def draw_barrier(
-    world: World, barrier: Barrier, image: NDArray[np.uint8], ids: NDArray[np.uint8], lighting: Lighting
-) -> None:
+def draw_barrier(world: World, barrier: Barrier, image: NDArray[np.uint8], ids: NDArray[np.uint8]) -> None:
     """Draw a barrier along the road, far to near."""
     course = world.course
     s = np.concatenate([np.arange(2.0, 40, 2.0), np.arange(40.0, FAR * 0.8, 8.0)]) - world.travelled % 8
@@ -55,7 +53,7 @@ def draw_barrier(
                 (u0, v0), (u1, v1) = world.camera.to_pixels(ends)
                 half = max(0.3, world.camera.fx * 0.05 / px)
                 box = np.array([[u0 - half, v0], [u0 + half, v0], [u1 + half, v1], [u1 - half, v1]])
-                fill(image, ids, box, lighting.tone((96.0, 98.0, 100.0), px, py))
+                fill(image, ids, box, world.light.tone((96.0, 98.0, 100.0), px, py))
         strips: tuple[tuple[float, float, float], ...] = ((0.42, 0.75, 1.0), (0.54, 0.60, 0.62))
     elif barrier.kind == "concrete":
         strips = ((0.0, 1.0, 0.85), (0.0, 0.3, 0.7))
@@ -76,27 +74,25 @@ def draw_barrier(
             upper = np.stack([x[span], y[span], np.full(j + 1 - i, peak)], axis=1)
             pixels = world.camera.to_pixels(np.concatenate([lower, upper[::-1]]))
             red, green, blue = barrier.colour
-            shade = lighting.tone(
+            shade = world.light.tone(
                 (red * gain * grain, green * gain * grain, blue * gain * grain), float(x[i]), float(y[i])
             )
             fill(image, ids, pixels, shade)
 
 
-def draw_item(
-    world: World, item: Item, image: NDArray[np.uint8], ids: NDArray[np.uint8], lighting: Lighting, lamps: list[Lamp]
-) -> None:
+def draw_item(world: World, item: Item, image: NDArray[np.uint8], ids: NDArray[np.uint8], lamps: list[Lamp]) -> None:
     """Draw a thing beside the road; its lights are added to ``lamps``."""
-    camera = world.camera
+    camera, light = world.camera, world.light
     x, y, _ = world.course.at(item.s, item.d)
     scale = camera.fx / x
     if item.kind in ("tree", "bush"):
         foot = camera.to_pixels(np.array([[x, y, 0.0], [x, y, item.height]]))
         sprite = _tree(item.style % 20) if item.kind == "tree" else _bush(item.style % 8)
-        _paste(image, ids, sprite, foot, item.width * scale, lighting, x, y)
+        _paste(image, ids, sprite, foot, item.width * scale, light, x, y)
     elif item.kind == "building":
-        _draw_building(world, item, image, ids, lighting)
+        _draw_building(world, item, image, ids)
     elif item.kind == "lamp":
-        tone = lighting.tone((88.0, 90.0, 92.0), x, y)
+        tone = light.tone((88.0, 90.0, 92.0), x, y)
         half = 0.07
         ends = np.array(
             [[x, y - half, 0], [x, y + half, 0], [x, y + half * 0.7, item.height], [x, y - half * 0.7, item.height]]
@@ -106,19 +102,19 @@ def draw_item(
                         [x, y + item.width, item.height + 0.08], [x, y, item.height - 0.1]])  # fmt: skip
         pixels = camera.to_pixels(arm)
         fill(image, ids, pixels, tone)
-        if world.light.time != "day":
+        if light.time != "day":
             u, v = pixels[1:3].mean(axis=0)
             lamps.append(Lamp(float(u), float(v), max(0.6, scale * 0.15), (255.0, 214.0, 150.0), 0.8, SCENERY))
     elif item.kind == "post":
         box = np.array([[x, y - 0.06, 0], [x, y + 0.06, 0], [x, y + 0.06, item.height], [x, y - 0.06, item.height]])
-        fill(image, ids, camera.to_pixels(box), lighting.tone((225.0, 225.0, 222.0), x, y))
+        fill(image, ids, camera.to_pixels(box), light.tone((225.0, 225.0, 222.0), x, y))
         box[:, 2] = (item.height * 0.7, item.height * 0.7, item.height * 0.85, item.height * 0.85)
-        fill(image, ids, camera.to_pixels(box), lighting.tone((40.0, 40.0, 42.0), x, y))
+        fill(image, ids, camera.to_pixels(box), light.tone((40.0, 40.0, 42.0), x, y))
     elif item.kind == "sign":
-        _draw_sign(camera, item, x, y, image, ids, lighting)
+        _draw_sign(camera, item, x, y, image, ids, light)
     elif item.kind == "gantry":
         right, left = world.layout.paved
-        grey = lighting.tone((120.0, 122.0, 125.0), x, y)
+        grey = light.tone((120.0, 122.0, 125.0), x, y)
         for edge in (right - 0.8, left + 0.8):
             px, py, _ = world.course.at(item.s, edge)
             pole = np.array([[px, py - 0.2, 0], [px, py + 0.2, 0], [px, py + 0.2, 6.6], [px, py - 0.2, 6.6]])
@@ -137,7 +133,7 @@ def draw_item(
                     for e, z in ((-1.5, 5.5), (1.5, 5.5), (1.5, 7.4), (-1.5, 7.4))
                 ]
             )
-            shine = max(0.35, world.light.ambient[1])
+            shine = max(0.35, light.ambient[1])
             tint: Colour = (18.0 * shine, 62.0 * shine, 140.0 * shine)
             if item.style % 2 == 0:
                 tint = (12.0 * shine, 96.0 * shine, 62.0 * shine)
@@ -145,20 +141,14 @@ def draw_item(
                 image,
                 ids,
                 camera.to_pixels(board),
-                lighting.lamp_tone(tint, x),
+                light.lamp_tone(tint, x),
             )
     elif item.kind == "pedestrian":
-        _draw_person(world, item, x, y, image, ids, lighting)
+        _draw_person(world, item, x, y, image, ids)
 
 
 def _draw_person(
-    world: World,
-    item: Item,
-    x: float,
-    y: float,
-    image: NDArray[np.uint8],
-    ids: NDArray[np.uint8],
-    lighting: Lighting,
+    world: World, item: Item, x: float, y: float, image: NDArray[np.uint8], ids: NDArray[np.uint8]
 ) -> None:
     rng = np.random.default_rng(item.style)
     coat, legs, skin = rng.uniform(20, 190, 3), rng.uniform(20, 90, 3), np.array([190.0, 150.0, 125.0])
@@ -167,7 +157,7 @@ def _draw_person(
         z = item.height * ((low + high) / 2 + (high - low) / 2 * np.sin(turn))
         ring = np.stack([np.full(10, x), y + wide * np.cos(turn), z], axis=1)
         red, green, blue = colour.tolist()
-        fill(image, ids, world.camera.to_pixels(ring), lighting.tone((red, green, blue), x, y))
+        fill(image, ids, world.camera.to_pixels(ring), world.light.tone((red, green, blue), x, y))
 
 
 def _draw_sign(
@@ -177,17 +167,17 @@ def _draw_sign(
     y: float,
     image: NDArray[np.uint8],
     ids: NDArray[np.uint8],
-    lighting: Lighting,
+    light: Light,
 ) -> None:
     pole = np.array([[x, y - 0.04, 0], [x, y + 0.04, 0], [x, y + 0.04, item.height], [x, y - 0.04, item.height]])
-    fill(image, ids, camera.to_pixels(pole), lighting.tone((130.0, 132.0, 134.0), x, y))
+    fill(image, ids, camera.to_pixels(pole), light.tone((130.0, 132.0, 134.0), x, y))
     half, centre = item.width / 2, item.height
     style = item.style % 4
     if item.width > 1.2:
         board = np.array([[x, y - half, centre - half * 0.6], [x, y + half, centre - half * 0.6],
                           [x, y + half, centre + half * 0.6], [x, y - half, centre + half * 0.6]])  # fmt: skip
         tint: Colour = ((22, 66, 146), (14, 98, 62), (228, 228, 226), (225, 178, 40))[style]
-        fill(image, ids, camera.to_pixels(board), lighting.tone(tint, x, y))
+        fill(image, ids, camera.to_pixels(board), light.tone(tint, x, y))
         return
     corners = (20, 20, 3, 4)[style]
     turn = np.linspace(0, 2 * math.pi, corners, endpoint=False) + (math.pi / 2)
@@ -197,7 +187,7 @@ def _draw_sign(
         ring = np.stack(
             [np.full(corners, x), y + half * share * np.cos(turn), centre + half * share * np.sin(turn)], axis=1
         )
-        fill(image, ids, camera.to_pixels(ring), lighting.tone(tint, x, y))
+        fill(image, ids, camera.to_pixels(ring), light.tone(tint, x, y))
 
 
 @functools.lru_cache(maxsize=16)
@@ -223,9 +213,7 @@ def _facade(style: int) -> NDArray[np.uint8]:
     return wall
 
 
-def _draw_building(
-    world: World, item: Item, image: NDArray[np.uint8], ids: NDArray[np.uint8], lighting: Lighting
-) -> None:
+def _draw_building(world: World, item: Item, image: NDArray[np.uint8], ids: NDArray[np.uint8]) -> None:
     course, camera = world.course, world.camera
     side = math.copysign(1.0, item.d)
     start, end = max(item.s, 2.5), item.s + item.width
@@ -249,7 +237,9 @@ def _draw_building(
         matrix = cv2.getPerspectiveTransform(
             np.array([[0, 0], [tw, 0], [tw, th], [0, th]], np.float32), (pixels - (left, top)).astype(np.float32)
         )
-        shade = [lighting.tone((255.0 * gain, 255.0 * gain, 255.0 * gain), px, py) for px, py in ((ax, ay), (bx, by))]
+        shade = [
+            world.light.tone((255.0 * gain, 255.0 * gain, 255.0 * gain), px, py) for px, py in ((ax, ay), (bx, by))
+        ]
         level = np.mean(shade, axis=0) / 255
         warped = cv2.warpPerspective(texture, matrix, (right - left, bottom - top), flags=cv2.INTER_LINEAR)
         haze = 1 - math.exp(-world.light.haze * (ax + bx) / 2)
@@ -321,7 +311,7 @@ def _paste(
     sprite: NDArray[np.uint8],
     foot: NDArray[np.float64],
     wide: float,
-    lighting: Lighting,
+    light: Light,
     x: float,
     y: float,
 ) -> None:
@@ -342,7 +332,7 @@ def _paste(
         return
     shrink = part.shape[1] > x1 - x0
     part = cv2.resize(part, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA if shrink else cv2.INTER_LINEAR)
-    white, black = lighting.tone((255.0, 255.0, 255.0), x, y), lighting.tone((0.0, 0.0, 0.0), x, y)
+    white, black = light.tone((255.0, 255.0, 255.0), x, y), light.tone((0.0, 0.0, 0.0), x, y)
     colours = cv2.transform(
         part,
         np.array(

@@ -221,6 +221,25 @@ class Light:
     lamps: bool
     wet: float
 
+    def tone(self, colour: Colour, x: float, y: float) -> Colour:
+        """Return the colour that a surface at (x, y) metres shows."""
+        beam = 0.0
+        if self.headlights:
+            spread = y / (1.6 + 0.22 * max(x, 0.0))
+            beam = self.headlights * math.exp(-spread * spread) * math.exp(-max(x, 0.0) / 38.0) * 0.8
+        clear = math.exp(-self.haze * max(x, 0.0))
+        red, green, blue = (
+            min(255.0, c * (a + beam)) * clear + h * (1 - clear)
+            for c, a, h in zip(colour, self.ambient, self.horizon, strict=True)
+        )
+        return red, green, blue
+
+    def lamp_tone(self, colour: Colour, x: float) -> Colour:
+        """As `tone`, for what shines by itself, ``x`` metres ahead."""
+        clear = math.exp(-self.haze * 0.5 * max(x, 0.0))
+        red, green, blue = (c * clear + h * (1 - clear) for c, h in zip(colour, self.horizon, strict=True))
+        return red, green, blue
+
 
 @dataclasses.dataclass(frozen=True)
 class Vehicle:
