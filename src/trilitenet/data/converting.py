@@ -205,7 +205,7 @@ def _convert_split(
 ) -> Iterator[str]:
     """Convert a split's images and yield their names one by one; at the end its files are those of a first run."""
     folders = [root / folder / split for folder in (IMAGE_FOLDER, *(folder for folder, _ in LABEL_FILES.values()))]
-    path = _journal_path(root / _STATE_FOLDER, split)
+    path = root / _STATE_FOLDER / f"{split}.jsonl"
     earlier = _read_journal(path)
     for name in earlier.keys() - set(names):
         _remove_files(root, split, name)
@@ -214,7 +214,7 @@ def _convert_split(
     if names:
         for folder in folders:
             folder.mkdir(parents=True, exist_ok=True)
-        _rewrite(path, _journal_text(earlier))
+        _write(path, _journal_text(earlier))
         with path.open("a", encoding="utf-8") as journal:
             for summary in _run(source, split, [(name, earlier.get(name)) for name in names], root, options, workers):
                 name = summary["name"]
@@ -223,7 +223,7 @@ def _convert_split(
                     journal.write(json.dumps(summary, sort_keys=True) + "\n")
                     journal.flush()
                 yield name
-        _rewrite(path, _journal_text(done))
+        _write(path, _journal_text(done))
     else:
         path.unlink(missing_ok=True)
     if not any("image" in summary for summary in done.values()):
@@ -390,7 +390,7 @@ def _convert_one(record: ImageRecord, split: str, root: Path, options: Conversio
             "attributes": record.attributes,
             "frames": [{"timestamp": 0, "objects": items}],
         }
-        _write(root / DETECTION_FOLDER / split / f"{record.name}.json", json.dumps(content).encode())
+        _write(root / DETECTION_FOLDER / split / f"{record.name}.json", json.dumps(content))
         summary["labelled"].append("detection")
         summary["objects"] = dict(sorted(counts.items()))
     if record.drivable is not None:
@@ -492,8 +492,9 @@ def _write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
     _write(path, cv2.imencode(".png", mask)[1].tobytes())
 
 
-def _write(path: Path, data: bytes) -> None:
+def _write(path: Path, content: str | bytes) -> None:
     """Write a file whole or not at all, and only if it differs."""
+    data = content.encode() if isinstance(content, str) else content
     try:
         if path.stat().st_size == len(data) and path.read_bytes() == data:
             return
@@ -501,10 +502,6 @@ def _write(path: Path, data: bytes) -> None:
         pass
     with replacing(path) as part:
         part.write_bytes(data)
-
-
-def _rewrite(path: Path, text: str) -> None:
-    _write(path, text.encode())
 
 
 def _place_image(source: Path, target: Path, options: ConversionOptions) -> None:
@@ -559,7 +556,7 @@ def _open_state(root: Path, options: ConversionOptions, origin: Mapping[str, str
         raise OutputError(f"{root}: is not empty and not of an earlier conversion; choose another folder")
     with writing(root):
         state.mkdir(parents=True, exist_ok=True)
-        _rewrite(path, text)
+        _write(path, text)
     return state
 
 
@@ -567,11 +564,7 @@ def _read_journals(state: Path, order: Iterable[str]) -> dict[str, dict[str, dic
     """Return the journals of all splits that are there: those of ``order`` first."""
     there = {path.stem for path in state.glob("*.jsonl")}
     splits = [*(split for split in order if split in there), *sorted(there - set(order))]
-    return {split: _read_journal(_journal_path(state, split)) for split in splits}
-
-
-def _journal_path(state: Path, split: str) -> Path:
-    return state / f"{split}.jsonl"
+    return {split: _read_journal(state / f"{split}.jsonl") for split in splits}
 
 
 def _read_journal(path: Path) -> dict[str, dict[str, Any]]:
@@ -674,8 +667,8 @@ def _finish(
     writer = csv.DictWriter(text, ["name", "split", *sorted(columns)], restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    _rewrite(root / "index.csv", text.getvalue())
-    _rewrite(root / "conversion.json", json.dumps(report.to_dict(), indent=1, sort_keys=True))
+    _write(root / "index.csv", text.getvalue())
+    _write(root / "conversion.json", json.dumps(report.to_dict(), indent=1, sort_keys=True))
     values = {255: "direct", ALTERNATIVE_VALUE: "alternative"} if options.keep_alternative else {255: "drivable"}
     whole = dataclasses.replace(
         description or DatasetDescription(name=root.name),
