@@ -31,6 +31,7 @@ from trilitenet.data.reading import (
     LABEL_FILES,
     decode_mask,
     is_crowd,
+    label_file,
     read_index,
 )
 from trilitenet.errors import DataError, import_extra
@@ -356,18 +357,18 @@ def _look(job: _Job, work: tuple[str, str]) -> _Facts:
     objects: dict[str, int] = {}
     box_sizes = np.zeros((0, 2), np.float32)
     attributes: dict[str, str] = {}
-    for task, (folder, ending) in LABEL_FILES.items():
-        label = job.root / folder / split / f"{name}{ending}"
-        if not label.is_file():
+    for task in LABEL_FILES:
+        where = label_file(task, split, name)
+        if not (job.root / where).is_file():
             continue
         if task == "detection":
-            objects, box_sizes, attributes = _look_at_boxes(job, label, size, faults)
+            objects, box_sizes, attributes = _look_at_boxes(job, where, size, faults)
             if task in tasks:
                 labelled.append(task)
         elif task in tasks:
             labelled.append(task)
             meaning = job.description.drivable if task == "drivable" else job.description.lane
-            part = _look_at_mask(label, f"{folder}/{split}/{name}{ending}", meaning, size, faults)
+            part = _look_at_mask(job.root / where, where, meaning, size, faults)
             if part is not None:
                 parts[task] = part
     if not labelled:
@@ -403,11 +404,10 @@ def _look_at_image(
 
 
 def _look_at_boxes(
-    job: _Job, path: Path, size: tuple[int, int] | None, faults: list[tuple[str, str]]
+    job: _Job, where: str, size: tuple[int, int] | None, faults: list[tuple[str, str]]
 ) -> tuple[dict[str, int], NDArray[np.float32], dict[str, str]]:
-    where = path.relative_to(job.root).as_posix()
     try:
-        content = parse_json(path.read_bytes())
+        content = parse_json((job.root / where).read_bytes())
         items = [item for frame in content["frames"] for item in (frame.get("objects") or ())]
         attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
         labels = [(str(item["category"]), item.get("box2d"), is_crowd(item)) for item in items]

@@ -40,12 +40,11 @@ from trilitenet.data.description import (
 from trilitenet.data.lane_edges import centre_line, pair_edges
 from trilitenet.data.rasterise import check_finite, draw_line, fill_polygon
 from trilitenet.data.reading import (
-    DETECTION_FOLDER,
-    DRIVABLE_FOLDER,
+    FOLDERS,
     IMAGE_ENDINGS,
     IMAGE_FOLDER,
     LABEL_FILES,
-    LANE_FOLDER,
+    label_file,
 )
 from trilitenet.data.records import (
     AreaLabel,
@@ -204,7 +203,7 @@ def _convert_split(
     source: RecordSource, split: str, names: list[str], root: Path, options: ConversionOptions, workers: int
 ) -> Iterator[str]:
     """Convert a split's images and yield their names one by one; at the end its files are those of a first run."""
-    folders = [root / folder / split for folder in (IMAGE_FOLDER, *(folder for folder, _ in LABEL_FILES.values()))]
+    folders = [root / folder / split for folder in FOLDERS]
     path = root / _STATE_FOLDER / f"{split}.jsonl"
     earlier = _read_journal(path)
     for name in earlier.keys() - set(names):
@@ -390,7 +389,7 @@ def _convert_one(record: ImageRecord, split: str, root: Path, options: Conversio
             "attributes": record.attributes,
             "frames": [{"timestamp": 0, "objects": items}],
         }
-        _write(root / DETECTION_FOLDER / split / f"{record.name}.json", json.dumps(content))
+        _write(root / label_file("detection", split, record.name), json.dumps(content))
         summary["labelled"].append("detection")
         summary["objects"] = dict(sorted(counts.items()))
     if record.drivable is not None:
@@ -401,7 +400,7 @@ def _convert_one(record: ImageRecord, split: str, root: Path, options: Conversio
             dropped["area with too few points"] += sum(
                 isinstance(area, AreaLabel) and len(area.points) < _CORNERS for area in record.drivable
             )
-        _write_mask(root / DRIVABLE_FOLDER / split / f"{record.name}.png", mask)
+        _write_mask(root / label_file("drivable", split, record.name), mask)
         summary["labelled"].append("drivable")
     if record.lane is not None:
         if isinstance(record.lane, MaskFile):
@@ -410,7 +409,7 @@ def _convert_one(record: ImageRecord, split: str, root: Path, options: Conversio
             mask, drawn, left_out = lane_mask(record.lane, size, options.width(split), options)
             dropped += left_out
             summary["lanes"] = dict(sorted(drawn.items()))
-        _write_mask(root / LANE_FOLDER / split / f"{record.name}.png", mask)
+        _write_mask(root / label_file("lane", split, record.name), mask)
         summary["labelled"].append("lane")
     if _has_ignored(record.drivable) or _has_ignored(record.lane):
         summary["ignore_value"] = True
@@ -587,7 +586,7 @@ def _files(split: str, summary: Mapping[str, Any]) -> set[str]:
     """Return the files of an image's line of the journal, from the root."""
     if "image" not in summary:
         return set()
-    labels = {f"{LABEL_FILES[task][0]}/{split}/{summary['name']}{LABEL_FILES[task][1]}" for task in summary["labelled"]}
+    labels = {label_file(task, split, summary["name"]) for task in summary["labelled"]}
     return {f"{IMAGE_FOLDER}/{split}/{summary['image']}"} | labels
 
 
@@ -599,8 +598,8 @@ def _is_complete(root: Path, split: str, summary: Mapping[str, Any]) -> bool:
 
 def _remove_files(root: Path, split: str, name: str, keep: Collection[str] = ()) -> None:
     """Remove what an earlier run wrote of an image and this one does not."""
-    for folder, ending in (*((IMAGE_FOLDER, ending) for ending in IMAGE_ENDINGS), *LABEL_FILES.values()):
-        file = f"{folder}/{split}/{name}{ending}"
+    images = (f"{IMAGE_FOLDER}/{split}/{name}{ending}" for ending in IMAGE_ENDINGS)
+    for file in (*images, *(label_file(task, split, name) for task in LABEL_FILES)):
         if file not in keep:
             (root / file).unlink(missing_ok=True)
 

@@ -36,12 +36,14 @@ from numpy.typing import NDArray
 from trilitenet.config import Task, check_size, parse_json
 from trilitenet.data.description import DESCRIPTION_FILE, read_description
 from trilitenet.data.reading import (
+    FOLDERS,
     IMAGE_ENDINGS,
     IMAGE_FOLDER,
     LABEL_FILES,
     DrivingDataset,
     SampleSource,
     decode_image,
+    label_file,
 )
 from trilitenet.data.sample import BOXES, MASKS, VALID, Sample
 from trilitenet.errors import ConfigError, DataError, OutputError, import_extra, replacing, writing
@@ -636,7 +638,7 @@ def _read_state(folder: Path) -> dict[str, Any]:
 
 
 def _files_of(root: Path, split: str) -> Iterator[str]:
-    for folder in (IMAGE_FOLDER, *(folder for folder, _ in LABEL_FILES.values())):
+    for folder in FOLDERS:
         if (root / folder / split).is_dir():
             yield from (f"{folder}/{split}/{path.name}" for path in (root / folder / split).iterdir())
     yield from _common_files(root)
@@ -658,7 +660,7 @@ def _made_from(dataset: DrivingDataset) -> str:
     files = [*_common_files(dataset.root)]
     for index, name in enumerate(dataset.names):
         files.append(f"{IMAGE_FOLDER}/{dataset.split}/{dataset.image_path(index).name}")
-        files += [f"{folder}/{dataset.split}/{name}{ending}" for folder, ending in LABEL_FILES.values()]
+        files += [label_file(task, dataset.split, name) for task in LABEL_FILES]
     return _digest(dataset.root, files)
 
 

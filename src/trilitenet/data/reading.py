@@ -32,12 +32,10 @@ from trilitenet.data.sample import Sample
 from trilitenet.errors import DataError, brief, did_you_mean
 
 __all__ = [
-    "DETECTION_FOLDER",
-    "DRIVABLE_FOLDER",
+    "FOLDERS",
     "IMAGE_ENDINGS",
     "IMAGE_FOLDER",
     "LABEL_FILES",
-    "LANE_FOLDER",
     "DrivingDataset",
     "MixedDataset",
     "SampleSource",
@@ -45,6 +43,7 @@ __all__ = [
     "decode_image",
     "decode_mask",
     "is_crowd",
+    "label_file",
     "parse_annotation",
     "read_index",
     "sampling_weights",
@@ -53,15 +52,13 @@ __all__ = [
 _LOGGER: Final = logging.getLogger(__name__)
 
 IMAGE_FOLDER: Final = "images"
-DETECTION_FOLDER: Final = "det_annotations"
-DRIVABLE_FOLDER: Final = "da_seg_annotations"
-LANE_FOLDER: Final = "ll_seg_annotations"
 LABEL_FILES: Final[dict[Task, tuple[str, str]]] = {
-    "detection": (DETECTION_FOLDER, ".json"),
-    "drivable": (DRIVABLE_FOLDER, ".png"),
-    "lane": (LANE_FOLDER, ".png"),
+    "detection": ("det_annotations", ".json"),
+    "drivable": ("da_seg_annotations", ".png"),
+    "lane": ("ll_seg_annotations", ".png"),
 }
 """Folder and file ending of a task's labels."""
+FOLDERS: Final = (IMAGE_FOLDER, *(folder for folder, _ in LABEL_FILES.values()))
 IMAGE_ENDINGS: Final = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
 
 _IGNORED: Final = 2
@@ -83,6 +80,12 @@ class SampleSource(Protocol):
 
     def attributes(self, index: int) -> dict[str, str]:
         """Return the attributes of a sample without decoding its image."""
+
+
+def label_file(task: Task, split: str, name: str) -> str:
+    """Return where an image's labels of a task are, from the root of the data set."""
+    folder, ending = LABEL_FILES[task]
+    return f"{folder}/{split}/{name}{ending}"
 
 
 def decode_image(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
@@ -260,8 +263,7 @@ class DrivingDataset:
 
     def label_path(self, task: Task, name: str) -> Path:
         """Return where an image's labels of a task are, if it has any."""
-        folder, ending = LABEL_FILES[task]
-        return self.root / folder / self.split / f"{name}{ending}"
+        return self.root / label_file(task, self.split, name)
 
     def has_labels(self, task: Task) -> bool:
         """Return whether an image is labelled for a task; looks up to the first."""

@@ -13,16 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from trilitenet.config import Task
 from trilitenet.data.description import DESCRIPTION_FILE, DatasetDescription, is_folder_name, write_description
-from trilitenet.data.reading import DETECTION_FOLDER, DRIVABLE_FOLDER, IMAGE_FOLDER, LANE_FOLDER
+from trilitenet.data.reading import FOLDERS, IMAGE_FOLDER, label_file
 from trilitenet.data.sample import Sample
 from trilitenet.data.synthetic import SyntheticScenes
 from trilitenet.errors import ConfigError, OutputError, replacing
 from trilitenet.processing.cores import ProcessPool
 
 __all__ = ["annotation", "write_dataset", "write_sample"]
-
-FOLDERS = (IMAGE_FOLDER, DETECTION_FOLDER, DRIVABLE_FOLDER, LANE_FOLDER)
 
 
 def write_dataset(
@@ -121,18 +120,15 @@ def write_sample(root: Path, split: str, sample: Sample) -> None:
     The image comes last: should the writing end, by a full disk for example, each image that is there has its labels.
     """
     if sample.boxes is not None:
-        with replacing(root / DETECTION_FOLDER / split / f"{sample.name}.json") as part:
+        with replacing(root / label_file("detection", split, sample.name)) as part:
             part.write_text(json.dumps(annotation(sample), separators=(",", ":")), encoding="utf-8")
-    for folder, mask in ((DRIVABLE_FOLDER, sample.drivable), (LANE_FOLDER, sample.lane)):
+    masks: dict[Task, NDArray[np.uint8] | None] = {"drivable": sample.drivable, "lane": sample.lane}
+    for task, mask in masks.items():
         if mask is not None:
-            with replacing(root / folder / split / f"{sample.name}.png") as part:
-                Image.fromarray(_visible(mask)).save(part, format="PNG")
+            with replacing(root / label_file(task, split, sample.name)) as part:
+                Image.fromarray((mask > 0).astype(np.uint8) * 255).save(part, format="PNG")
     with replacing(root / IMAGE_FOLDER / split / f"{sample.name}.jpg") as part:
         Image.fromarray(sample.image).save(part, format="JPEG", quality=92)
-
-
-def _visible(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return (mask > 0).astype(np.uint8) * 255
 
 
 def annotation(sample: Sample) -> dict[str, object]:
