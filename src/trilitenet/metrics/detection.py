@@ -357,14 +357,18 @@ class DetectionMetric:
             )
         return ranked
 
+    def _verdicts(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return whether each box is right at IoU 0.5, and whether it is wrong; one that counts neither way is not."""
+        hit = (self._matched.array[:, 0] & np.uint16(1)) != 0
+        return hit, ~hit & ((self._ignored.array[:, 0] & np.uint16(1)) == 0)
+
     def curve(self) -> DetectionCurve:
         """Return precision and recall at IoU 0.5 along falling confidence, all classes together."""
+        hit, wrong = self._verdicts()
         order = np.argsort(-self._scores.array[:, 0], kind="stable")
-        bit = np.uint16(1)
-        order = order[(self._ignored.array[order, 0] & bit) == 0]
-        hit = (self._matched.array[order, 0] & bit) != 0
+        order = order[(hit | wrong)[order]]
         scores = self._scores.array[order, 0].astype(np.float64)
-        right = np.cumsum(hit)
+        right = np.cumsum(hit[order])
         last = np.flatnonzero(np.append(scores[1:] != scores[:-1], True)) if len(scores) else np.zeros(0, np.int64)
         objects = self._objects.array[:, :: len(AREAS)].sum()
         return DetectionCurve(
@@ -376,27 +380,16 @@ class DetectionMetric:
     def histogram(self, bins: int = 20) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return how many right and wrong boxes (IoU 0.5) fall into equal bins of confidence from 0 to 1."""
         scores = self._scores.array[:, 0]
-        hit = (self._matched.array[:, 0] & np.uint16(1)) != 0
-        wrong = ~hit & ((self._ignored.array[:, 0] & np.uint16(1)) == 0)
+        hit, wrong = self._verdicts()
         edges = np.linspace(0, 1, bins + 1)
         return np.histogram(scores[hit], edges)[0], np.histogram(scores[wrong], edges)[0]
 
     def _point_figures(self, weights: NDArray[Any] | None) -> dict[str, FloatArray]:
         """Precision, recall and F1 at the stated confidence and IoU 0.5, from sums an image."""
-        count = len(self)
-        bit = np.uint16(1)
         above = self._scores.array[:, 0] > self.confidence
-        hit = ((self._matched.array[:, 0] & bit) != 0) & above
-        wrong = ((self._matched.array[:, 0] & bit) == 0) & ((self._ignored.array[:, 0] & bit) == 0) & above
         image = self._image.array[:, 0]
-        table = np.stack(
-            [
-                np.bincount(image[hit], minlength=count),
-                np.bincount(image[wrong], minlength=count),
-                self._objects.array[:, :: len(AREAS)].sum(axis=1),
-            ],
-            axis=1,
-        )
+        boxes = [np.bincount(image[which & above], minlength=len(self)) for which in self._verdicts()]
+        table = np.stack([*boxes, self._objects.array[:, :: len(AREAS)].sum(axis=1)], axis=1)
         right, bad, objects = weighted_sum(table, weights).T
         return {
             "precision": ratio(right, right + bad),
@@ -439,7 +432,7 @@ class DetectionMetric:
             both_empty=int(empty.sum()),
             not_labelled=int((~labelled).sum()),
             objects=int(objects.sum()),
-            boxes=int(((self._ignored.array[:, 0] & np.uint16(1)) == 0).sum()),
+            boxes=int(np.logical_or(*self._verdicts()).sum()),
             ap50=float(mean_known(ap[None, :, 0])[0]),
             ap75=float(mean_known(ap[None, :, 5])[0]),
             ap=float(mean_known(ap.reshape(1, -1))[0]),
