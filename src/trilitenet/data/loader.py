@@ -147,21 +147,7 @@ class _Plan(torch.utils.data.Sampler[list[_Draw]]):
 
 
 class Loader:
-    """Batches of a data set; made by `build_loader`.
-
-    Args:
-        dataset: Where samples come from.
-        transform: Brings each sample to one canvas.
-        batch_size: Samples a batch.
-        seed: Of order and augmentation.
-        shuffle: Shuffle (and weigh) the samples; else the data set's own order.
-        weights: (N,) relative weights of the samples.
-        samples_per_epoch: Length of an epoch; the number of samples if left out.
-        drop_last: Leave out a last batch that is not full.
-        workers: Processes that read ahead; 0 reads in this one.
-        pin_memory: Put batches into page-locked memory, for a GPU.
-        share: (index, count): give the index-th of count equal parts of every batch, for one of several processes.
-    """
+    """Batches of a data set; made by `build_loader`, which checks and describes its arguments."""
 
     def __init__(
         self,
@@ -172,18 +158,18 @@ class Loader:
         seed: int,
         shuffle: bool,
         weights: NDArray[np.float64] | None,
-        samples_per_epoch: int | None,
+        length: int,
         drop_last: bool,
         workers: int,
         pin_memory: bool,
-        share: tuple[int, int] = (0, 1),
+        share: tuple[int, int],
     ) -> None:
         self.dataset = dataset
         self.batch_size = batch_size
         self.seed = seed
         self._shuffle = shuffle
         self._weights = weights
-        self._length = samples_per_epoch or len(dataset)
+        self._length = length
         self._drop_last = drop_last
         self._share = share
         self._plan = _Plan()
@@ -291,7 +277,7 @@ def build_loader(
         seed=seed,
         shuffle=shuffle,
         weights=weights,
-        samples_per_epoch=samples_per_epoch,
+        length=length,
         drop_last=drop_last,
         workers=workers,
         pin_memory=pin_memory,
