@@ -145,15 +145,10 @@ def _warp(canvas: NDArray[np.uint8], camera: Camera, view: View) -> NDArray[np.u
     if camera.distortion:
         place, part = _above_maps(camera, view)
         return np.asarray(cv2.remap(canvas, place, part, cv2.INTER_LINEAR, borderValue=_PLATE), np.uint8)
-    matrix = _above_matrix(camera, view)
+    matrix = camera.ground_homography @ view.matrix
     height, width = view.size
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpPerspective(canvas, matrix, (width, height), flags=flags, borderValue=_PLATE), np.uint8)
-
-
-@functools.lru_cache(maxsize=8)
-def _above_matrix(camera: Camera, view: View) -> NDArray[np.float64]:
-    return camera.ground_homography @ view.matrix
 
 
 @functools.lru_cache(maxsize=8)
