@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import gc
 import os
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -45,6 +47,25 @@ def test_prefetch_gives_all_in_order_and_the_error_at_its_place() -> None:
     with pytest.raises(ValueError, match="at the end"):
         next(ahead)
     assert list(ahead) == []
+
+
+def test_a_prefetch_that_nobody_closed_ends_before_the_process() -> None:
+    script = """
+import itertools, time
+from trilitenet.inference.video import Prefetch
+
+def items():
+    try:
+        for i in itertools.count():
+            time.sleep(0.01)
+            yield i
+    finally:
+        print("closed")
+
+next(Prefetch(items(), 1))
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert (ended.stdout, ended.stderr) == ("closed\n", "")
 
 
 def test_prefetch_runs_only_so_far_ahead() -> None:

@@ -8,6 +8,7 @@ length of the video.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import dataclasses
 import itertools
@@ -86,6 +87,9 @@ class Prefetch(Generic[T]):
         self._thread.join(timeout=30)
 
     def _run(self, items: Iterator[T]) -> None:
+        # A thread that is in a runtime's code when Python ends would abort the process. Ctrl-C may have come before
+        # anybody could close it.
+        atexit.register(self.close)
         try:
             for item in items:
                 with self._changed:
@@ -109,6 +113,7 @@ class Prefetch(Generic[T]):
             with self._changed:
                 self._ended = True
                 self._changed.notify_all()
+            atexit.unregister(self.close)
 
 
 class PerceptionStream:
