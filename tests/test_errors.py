@@ -13,6 +13,7 @@ from trilitenet.errors import (
     MissingExtraError,
     OutputError,
     did_you_mean,
+    import_extra,
     needing_torch,
     part_of,
     replacing,
@@ -136,3 +137,15 @@ def test_only_pytorch_itself_is_told_to_be_missing(name: str, told: bool) -> Non
     with pytest.raises(MissingExtraError if told else ModuleNotFoundError) as caught, needing_torch():
         raise ModuleNotFoundError(f"No module named {name!r}", name=name)
     assert isinstance(caught.value, MissingExtraError) == told
+
+
+def test_an_import_that_is_interrupted_is_not_taken_for_a_missing_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    stopped = "raise ImportError('initialization failed') from KeyboardInterrupt()"  # as by pybind11
+    (tmp_path / "stopped_runtime.py").write_text(stopped)
+    with pytest.raises(KeyboardInterrupt):
+        import_extra("stopped_runtime", "runtime")
+    with pytest.raises(MissingExtraError, match=r"pip install 'trilitenet\[runtime\]'"):
+        import_extra("no_such_runtime", "runtime")

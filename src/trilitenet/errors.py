@@ -140,6 +140,8 @@ def import_extra(module: str, extra: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError as error:
+        if isinstance(error.__cause__, KeyboardInterrupt):  # pybind11's modules make an ImportError of it
+            raise error.__cause__ from None
         raise MissingExtraError(
             f"this needs {module!r} ({error}); install it with: pip install 'trilitenet[{extra}]'"
         ) from error
