@@ -107,7 +107,7 @@ def get_variant(name: str) -> VariantConfig:
     Raises:
         ConfigError: If there is none; the message lists those that exist.
     """
-    if name not in VARIANTS:
+    if name not in list(VARIANTS):  # which also takes what cannot be a key
         raise ConfigError(f"unknown variant {name!r}; known: {', '.join(VARIANTS)}")
     return VARIANTS[name]
 
@@ -125,7 +125,7 @@ def check_tasks(tasks: tuple[str, ...] | list[str]) -> tuple[Task, ...]:
     """
     for task in tasks:
         if task not in TASKS:
-            raise ConfigError(f"unknown task {task!r}{did_you_mean(task, TASKS)}")
+            raise ConfigError(f"unknown task {task!r}{did_you_mean(str(task), TASKS)}")
     chosen = tuple(task for task in TASKS if task in tasks)
     if not chosen:
         raise ConfigError(f"at least one task is needed, of {', '.join(TASKS)}")
@@ -342,18 +342,25 @@ def check_size(size: tuple[int, int], name: str = "size") -> None:
         raise ConfigError(f"{name} must be multiples of {MAX_STRIDE}, got {size[0]}x{size[1]} (height x width)")
 
 
-def check_anchors(anchors: Anchors) -> None:
-    """Refuse anchors that no head can use.
+def check_anchors(anchors: Any) -> Anchors:
+    """Return anchors, which may be lists, an array or a tensor, as plain numbers.
 
     Raises:
         ConfigError: If they are not 3 sizes a level, above 0 and finite.
     """
-    counts = [len(level) for level in anchors]
+    try:
+        levels = tuple(tuple((float(width), float(height)) for width, height in level) for level in anchors)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(
+            f"anchors must be {len(STRIDES)} levels of 3 sizes, each a width and a height, got {shown(anchors)}"
+        ) from error
+    counts = [len(level) for level in levels]
     if counts != [3] * len(STRIDES):
         raise ConfigError(f"anchors must be {len(STRIDES)} levels of 3 sizes, got {counts}")
-    for side in (side for level in anchors for pair in level for side in pair):
+    for side in (side for level in levels for pair in level for side in pair):
         if not 0 < side < math.inf:
             raise ConfigError(f"anchors must be above 0 and finite, got {side}")
+    return levels
 
 
 def parse_yaml(text: str, source: str) -> Any:

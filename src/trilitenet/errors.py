@@ -111,7 +111,7 @@ def brief(error: BaseException) -> str:
 def shown(value: object) -> str:
     """Return the ``repr`` of a value for a message, which of a whole list or text would not be one line to read."""
     try:
-        text = repr(value)
+        text = " ".join(line.strip() for line in repr(value).splitlines())  # an array's has several
     except ValueError:  # a whole number that Python does not write
         return "a number of thousands of digits"
     return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]} ..."

@@ -13,7 +13,7 @@ from torch import nn
 
 from tests.models.conftest import published_state
 from trilitenet import build_network, load_network
-from trilitenet.config import IMAGE_MEAN, IMAGE_STD, TASKS, VARIANTS
+from trilitenet.config import DEFAULT_ANCHORS, IMAGE_MEAN, IMAGE_STD, TASKS, VARIANTS
 from trilitenet.errors import ConfigError, ShapeError
 from trilitenet.models.attention import PCAA
 from trilitenet.models.blocks import ConvBNPReLU, DepthwiseESP, DilatedConv
@@ -113,10 +113,28 @@ def test_bad_arguments_name_what_is_valid() -> None:
         build_network("large")
     with pytest.raises(ConfigError, match="did you mean 'lane'"):
         build_network("tiny", tasks=("lanes",))
-    with pytest.raises(ConfigError, match="at least 1"):
-        build_network("tiny", classes=0)
-    with pytest.raises(ConfigError, match=r"anchors must be 3 levels of 3 sizes, got \[2\]"):
-        build_network("tiny", anchors=((1, 2),))  # type: ignore[arg-type]
+    for tasks in (5, None, [1]):
+        with pytest.raises(ConfigError, match=r"unknown task .*; known: detection, drivable, lane"):
+            build_network("tiny", tasks=tasks)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="unknown variant"):
+        build_network(["tiny"])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("classes", [0, "2", 1.5, None, ["car", "bus"]])
+def test_a_class_count_that_is_none_is_refused(classes: Any) -> None:
+    with pytest.raises(ConfigError, match=r"^classes must be how many there are, at least 1, got "):
+        build_network("tiny", classes)
+
+
+@pytest.mark.parametrize("anchors", [5, "abc", ((1, 2),), torch.ones(3, 3, 3), [[["a", 2]] * 3] * 3])
+def test_anchors_that_are_no_sizes_are_refused_in_one_line(anchors: Any) -> None:
+    with pytest.raises(ConfigError, match=r"^anchors must be 3 levels of 3 sizes, each a width and a height, got .*$"):
+        build_network("tiny", anchors=anchors)
+
+
+@pytest.mark.parametrize("kind", [torch.tensor, np.array, list])
+def test_anchors_may_be_a_tensor_an_array_or_lists_and_are_kept_as_numbers(kind: Any) -> None:
+    assert build_network("tiny", np.int64(2), anchors=kind(DEFAULT_ANCHORS)).card.anchors == DEFAULT_ANCHORS
 
 
 def test_decode_by_hand() -> None:

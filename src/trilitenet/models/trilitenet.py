@@ -7,8 +7,9 @@ paper leaves out follows the authors' public code, https://github.com/chequanghu
 from __future__ import annotations
 
 import functools
+import numbers
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final, NamedTuple
 
 import torch
@@ -28,7 +29,7 @@ from trilitenet.config import (
     check_tasks,
     get_variant,
 )
-from trilitenet.errors import ConfigError, ShapeError
+from trilitenet.errors import ConfigError, ShapeError, shown
 from trilitenet.models.attention import PCAA
 from trilitenet.models.blocks import ConvBNPReLU, DepthwiseConv
 from trilitenet.models.detection import SPP, DetectionHead, LitePAN, decode_level
@@ -76,7 +77,7 @@ class TriLiteNet(nn.Module):
         anchors: Anchors,
     ) -> None:
         super().__init__()
-        check_anchors(anchors)
+        anchors = check_anchors(anchors)
         config = get_variant(variant)
         c0, c1, c2, c3, c4 = config.channels
         self.variant = variant
@@ -160,7 +161,7 @@ def build_network(
     pcaa: bool = True,
     litepan: bool = True,
     spp: bool = True,
-    anchors: Anchors | None = None,
+    anchors: Anchors | Tensor | None = None,
 ) -> TriLiteNet:
     """Build the network with fresh random weights.
 
@@ -171,18 +172,19 @@ def build_network(
         pcaa: With partial class activation attention (off: the paper's ablation).
         litepan: With LitePAN's two paths (off: only its lateral convolutions).
         spp: With spatial pyramid pooling.
-        anchors: (width, height) in input pixels, three a level; defaults to `DEFAULT_ANCHORS`.
+        anchors: (width, height) in input pixels, three a level, as lists, array or tensor; defaults to
+            `DEFAULT_ANCHORS`.
 
     Raises:
-        ConfigError: On an unknown variant or task, fewer than one class, or unusable anchors.
+        ConfigError: On an unknown variant or task, a class count that is none, or unusable anchors.
     """
-    if classes < 1:
-        raise ConfigError(f"classes must be at least 1, got {classes}")
-    if isinstance(tasks, str):
+    if not isinstance(classes, numbers.Integral) or classes < 1:
+        raise ConfigError(f"classes must be how many there are, at least 1, got {shown(classes)}")
+    if isinstance(tasks, str) or not isinstance(tasks, Iterable):
         tasks = (tasks,)
     blocks = tuple(name for name, on in (("pcaa", pcaa), ("litepan", litepan), ("spp", spp)) if on)
     return TriLiteNet(
-        variant, classes, check_tasks(tuple(tasks)), blocks, DEFAULT_ANCHORS if anchors is None else anchors
+        variant, int(classes), check_tasks(tuple(tasks)), blocks, DEFAULT_ANCHORS if anchors is None else anchors
     )
 
 
