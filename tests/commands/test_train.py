@@ -233,6 +233,20 @@ def test_accumulation_sees_the_same_images(scenes: Path, tmp_path: Path) -> None
     assert losses[0]["train/objectness"] == pytest.approx(losses[1]["train/objectness"], rel=0.05)
 
 
+def test_a_step_takes_one_exchange_between_processes(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, plain = [], Trainer._any
+
+    def count(self: Trainer, *here: bool) -> tuple[bool, ...]:
+        asked.append(self.step)
+        return plain(self, *here)
+
+    monkeypatch.setattr(Trainer, "_any", count)
+    train(**settings(scenes, tmp_path, max_steps=4, samples_per_epoch=40))
+    assert [asked.count(step) for step in (1, 2, 3)] == [1, 1, 1]
+
+
 @pytest.mark.parametrize("workers", [0, 1])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_saves_and_ends_cleanly(

@@ -315,32 +315,23 @@ class Trainer:
         """Run the optimiser steps of an epoch, from its step ``start`` on."""
         self.model.train()
         keep_frozen(self.network, self.config.freeze)
-        passes = self.config.accumulate
-        batches = self.loader.epoch(epoch, start=start * passes)
+        batches = self.loader.epoch(epoch, start=start * self.config.accumulate)
         sums = torch.zeros(len(LossTerms._fields) + 1, device=self.fabric.device)
-        mark, since = time.perf_counter(), 0
-        while group := self._read(batches):
-            if len(group) < passes:
-                break
+        rate, mark, since = 0.0, time.perf_counter(), 0
+        while group := self._read(batches, stop):
             rate = self.schedule.apply(self.optimiser, self.step)
             sums += self._train_step(group)
             self.step += 1
             since += sum(len(batch) for batch in group) * self.fabric.world_size
-            stopped = self._stopped(stop)
-            last = self.step >= self.steps or self.step % self.epoch_steps == 0
-            if self.step % self.config.log_every == 0 or last or stopped:
-                elapsed = time.perf_counter() - mark
-                self.seconds, self.images = self.seconds + elapsed, self.images + since
-                self._log_losses(epoch, sums, rate, since / elapsed)
-                sums.zero_()
+            if self.step % self.config.log_every == 0:
+                self._log_losses(epoch, sums, rate, mark, since)
                 mark, since = time.perf_counter(), 0
-                stopped = self._stopped(stop)  # the wish may have come while that was told
-            if self.step >= self.steps or stopped:
-                break
+        if since:
+            self._log_losses(epoch, sums, rate, mark, since)
         self.guard.look()
 
-    def _read(self, batches: Iterator[Batch]) -> list[Batch]:
-        """Return the batches of an optimiser step; fewer, or none, at the end.
+    def _read(self, batches: Iterator[Batch], stop: StopRequest) -> list[Batch]:
+        """Return the batches of an optimiser step; none at the end, or once any of the processes was asked to stop.
 
         Raises:
             DataError: If an image or label cannot be read by any of the processes: the first one is to save.
@@ -348,16 +339,17 @@ class Trainer:
         group: list[Batch] = []
         failed: DataError | None = None
         try:
-            group = list(itertools.islice(batches, self.config.accumulate))
+            if not stop and self.step < self.steps:
+                group = list(itertools.islice(batches, self.config.accumulate))
         except DataError as error:
             failed = error
-        if self._any(failed is not None):
-            told = [None if failed is None else str(failed)]
+        asked, broken = self._any(bool(stop), failed is not None)
+        if broken:
+            told = [failed] * self.fabric.world_size
             if self.fabric.world_size > 1:
-                own, told = told[0], told * self.fabric.world_size
-                torch.distributed.all_gather_object(told, own)
-            raise DataError(next(filter(None, told))) from failed
-        return group
+                torch.distributed.all_gather_object(told, failed)
+            raise next(filter(None, told))
+        return [] if asked or len(group) < self.config.accumulate else group
 
     def _train_step(self, batches: Sequence[Batch]) -> Tensor:
         """Run one optimiser step; return the loss terms and 1, or zeros if it was left out."""
@@ -464,20 +456,23 @@ class Trainer:
 
     def _stopped(self, stop: StopRequest) -> bool:
         """Return whether any process was asked to stop."""
-        return self._any(bool(stop))
+        return self._any(bool(stop))[0]
 
-    def _any(self, here: bool) -> bool:
-        """Return whether something is so in any process."""
+    def _any(self, *here: bool) -> tuple[bool, ...]:
+        """Return of each thing whether it is so in any process."""
         if self.fabric.world_size == 1:
             return here
-        so = torch.tensor(float(here), device=self.fabric.device)
-        return bool(self.fabric.all_reduce(so, reduce_op="sum") > 0)
+        so = torch.tensor(here, dtype=torch.float32, device=self.fabric.device)
+        return tuple((self.fabric.all_reduce(so, reduce_op="sum") > 0).tolist())
 
-    def _log_losses(self, epoch: int, sums: Tensor, rate: float, speed: float) -> None:
-        """Log the mean losses of all processes since the last time; every process takes part."""
-        if self.fabric.world_size > 1:
-            sums = self.fabric.all_reduce(sums.clone())
-        *means, _ = (sums / sums[-1]).tolist()  # NaN where every step was left out
+    def _log_losses(self, epoch: int, sums: Tensor, rate: float, mark: float, since: int) -> None:
+        """Log the mean losses of all processes, of so many images since a time, and clear the sums; all take part."""
+        elapsed = time.perf_counter() - mark
+        speed = since / elapsed
+        self.seconds, self.images = self.seconds + elapsed, self.images + since
+        whole = sums if self.fabric.world_size == 1 else self.fabric.all_reduce(sums.clone())
+        *means, _ = (whole / whole[-1]).tolist()  # NaN where every step was left out
+        sums.zero_()
         losses = dict(zip(LossTerms._fields, means, strict=True))
         figures = {f"train/{name}": value for name, value in losses.items()}
         self._tell(figures | {"lr": rate, "images_per_second": speed})
