@@ -1,14 +1,16 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch
 
+import trilitenet
 from trilitenet.errors import BackendError, ShapeError
-from trilitenet.inference.torch_backend import TorchBackend, pick_device
+from trilitenet.inference.torch_backend import TorchBackend, check_threads, pick_device
 from trilitenet.models.trilitenet import build_network
 
 
@@ -128,3 +130,17 @@ def test_pixels_are_normalised_as_the_card_says(rng: np.random.Generator) -> Non
     assert lane is not None
     assert found is not None
     assert np.abs(found - lane.softmax(1)[:, 1].numpy() * 255).max() <= 0.51
+
+
+def test_a_fork_is_told_that_it_lacks_the_threads(backend: TorchBackend, monkeypatch: pytest.MonkeyPatch) -> None:
+    batch = np.zeros((1, 64, 64, 3), np.uint8)
+    monkeypatch.setattr("trilitenet.inference.torch_backend._parallel_in", None)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    check_threads()
+    backend.run(batch)
+    monkeypatch.setattr(os, "getpid", lambda: -1)
+    for use in (lambda: backend.run(batch), lambda: trilitenet.load("tiny"), lambda: trilitenet.load("a.pt2")):
+        with pytest.raises(BackendError, match="before this process was forked; load the model with threads=1"):
+            use()
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    assert backend.run(batch).lane is not None

@@ -140,9 +140,10 @@ def open_backend(
 
 
 def _open_torch(model: str | os.PathLike[str], device: str, *, fastest: bool) -> Backend:
-    from trilitenet.inference.torch_backend import TorchBackend, pick_device
+    from trilitenet.inference.torch_backend import TorchBackend, check_threads, pick_device
     from trilitenet.models.weights import load_network
 
+    check_threads()
     network = load_network(model)
     if fastest and pick_device(device).type == "cuda":
         import torch

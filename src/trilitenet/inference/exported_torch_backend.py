@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY
 from trilitenet.errors import ShapeError, WeightsError
 from trilitenet.inference.exported import ArtefactBackend, prepare_input, read_metadata
-from trilitenet.inference.torch_backend import pick_device
+from trilitenet.inference.torch_backend import check_threads, pick_device
 
 __all__ = ["ExportedTorchBackend"]
 
@@ -29,9 +29,11 @@ class ExportedTorchBackend(ArtefactBackend):
 
     Raises:
         WeightsError: If the file is missing, broken or foreign, or of a newer layout.
+        BackendError: If the device cannot be used, or the process lacks PyTorch's threads (see `check_threads`).
     """
 
     def __init__(self, path: str | os.PathLike[str], device: str = "auto") -> None:
+        check_threads()
         path = Path(path)
         if not path.is_file():
             raise WeightsError(f"{path}: no such file")
@@ -63,6 +65,7 @@ class ExportedTorchBackend(ArtefactBackend):
         return f"torch program {self.device}"
 
     def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
+        check_threads()
         height, width = batch.shape[1:3]
         if self.info.size is None and min(height, width) < 64:
             raise ShapeError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator
 
 import numpy as np
@@ -16,7 +17,28 @@ from trilitenet.inference.backend import MOST_PARALLEL, check_batch
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
 from trilitenet.structures import RawOutputs
 
-__all__ = ["TorchBackend", "pick_device"]
+__all__ = ["TorchBackend", "check_threads", "pick_device"]
+
+_parallel_in: int | None = None
+"""Number of the process in which PyTorch first had several threads to work with."""
+
+
+def check_threads() -> None:
+    """Check that PyTorch's threads are of this process: a fork lacks them, and would wait for them for ever.
+
+    Raises:
+        BackendError: If this process was forked from one where PyTorch had several threads, and is to use several too.
+    """
+    global _parallel_in
+    if torch.get_num_threads() == 1:
+        return
+    if _parallel_in is None:
+        _parallel_in = os.getpid()
+    if os.getpid() != _parallel_in:
+        raise BackendError(
+            "PyTorch worked on several threads before this process was forked; load the model with threads=1, or start "
+            "processes with multiprocessing.get_context('spawn')"
+        )
 
 
 def pick_device(device: str = "auto") -> torch.device:
@@ -47,10 +69,11 @@ class TorchBackend:
         canvas: Fix the input to this (height, width), as artefacts do; None takes any size in multiples of 32.
 
     Raises:
-        BackendError: If the device cannot be used.
+        BackendError: If the device cannot be used, or the process lacks PyTorch's threads (see `check_threads`).
     """
 
     def __init__(self, network: TriLiteNet, device: str = "auto", canvas: tuple[int, int] | None = None) -> None:
+        check_threads()
         self._canvas = canvas
         self.device = pick_device(device)
         self.network: TriLiteNet = network.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
@@ -73,6 +96,7 @@ class TorchBackend:
     def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
         """Run the network on (B, H, W, 3) uint8 RGB; see `Backend.run`."""
         check_batch(batch)
+        check_threads()
         batch = np.ascontiguousarray(batch)  # PyTorch takes no reversed axes
         try:
             with torch.inference_mode():
