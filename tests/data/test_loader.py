@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -63,6 +64,17 @@ def test_workers_change_nothing(dataset: DrivingDataset) -> None:
     for epoch, start in ((0, 0), (1, 2)):
         pairs = zip(alone.epoch(epoch, start=start), workers.epoch(epoch, start=start), strict=True)
         assert all(same(one, two) for one, two in pairs)
+
+
+def test_opencv_keeps_its_threads_in_this_process(dataset: DrivingDataset) -> None:
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(3)
+    try:
+        loader = build_loader(dataset, EvalTransform(CANVAS), batch_size=4, workers=1)
+        assert len(list(loader)) == len(loader)
+        assert cv2.getNumThreads() == 3
+    finally:
+        cv2.setNumThreads(before)
 
 
 _WITH_A_THREAD = """

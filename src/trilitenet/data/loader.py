@@ -5,13 +5,14 @@ Whatever the number of workers, and whether an epoch is run through or taken up 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import multiprocessing
 import os
 import signal
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any, Final
 
 import cv2
@@ -114,13 +115,15 @@ def _collate(samples: list[Sample | TriLiteNetError]) -> Batch | TriLiteNetError
     return collate(whole)
 
 
-def _batches(loader: Iterable[Batch | TriLiteNetError], plan: _Plan, batches: list[list[_Draw]]) -> Iterator[Batch]:
+def _batches(
+    loader: torch.utils.data.DataLoader[Batch | TriLiteNetError], plan: _Plan, batches: list[list[_Draw]]
+) -> Iterator[Batch]:
     """Yield the batches of a plan.
 
     Raises:
         RuntimeError: If a worker was killed; its text begins with `WORKER_LOST`.
     """
-    with held_back(signal.SIGTERM):  # in all threads of the workers, see `_start_worker`
+    with _starting(loader.num_workers):
         plan.batches = batches
         following = iter(loader)
     try:
@@ -131,6 +134,24 @@ def _batches(loader: Iterable[Batch | TriLiteNetError], plan: _Plan, batches: li
     except (EOFError, OSError) as error:  # it was killed while it handed a batch over
         time.sleep(1.0)  # PyTorch raises which one as soon as the system tells of its end
         raise RuntimeError(f"{WORKER_LOST} lost ({error})") from error
+
+
+@contextlib.contextmanager
+def _starting(workers: int) -> Iterator[None]:
+    """Inside, workers are started: SIGTERM is held back in all their threads, see `_start_worker`.
+
+    They are the parallelism, so OpenCV works on one thread in each. A forked one takes this over; setting it there
+    would wait for ever for OpenCV's threads, which a fork leaves behind.
+    """
+    threads = cv2.getNumThreads()
+    if workers:
+        cv2.setNumThreads(0)
+    try:
+        with held_back(signal.SIGTERM):
+            yield
+    finally:
+        if workers:
+            cv2.setNumThreads(threads)
 
 
 class _Plan(torch.utils.data.Sampler[list[_Draw]]):
@@ -173,10 +194,6 @@ class Loader:
         self._drop_last = drop_last
         self._share = share
         self._plan = _Plan()
-        if workers:
-            # The workers are the parallelism. A forked one takes this over; setting it there would wait for ever for
-            # OpenCV's threads, which a fork leaves behind.
-            cv2.setNumThreads(0)
         more: dict[str, Any] = {"persistent_workers": True, "prefetch_factor": 4} if workers else {}
         self._loader: torch.utils.data.DataLoader[Batch | TriLiteNetError] = torch.utils.data.DataLoader(
             _Samples(dataset, transform, seed, weights if shuffle else None),  # type: ignore[arg-type]
