@@ -66,6 +66,14 @@ def test_workers_change_nothing(dataset: DrivingDataset) -> None:
         assert all(same(one, two) for one, two in pairs)
 
 
+@pytest.mark.parametrize("workers", [0, 2])
+def test_epochs_may_be_taken_in_turns(dataset: DrivingDataset, workers: int) -> None:
+    loader = build_loader(dataset, EvalTransform(CANVAS), batch_size=4, seed=3, workers=workers)
+    alone = [[batch.names for batch in loader.epoch(epoch)] for epoch in (0, 1)]
+    turns = zip(loader.epoch(0), loader.epoch(1), strict=True)
+    assert [[one.names, two.names] for one, two in turns] == [list(pair) for pair in zip(*alone, strict=True)]
+
+
 def test_opencv_keeps_its_threads_in_this_process(dataset: DrivingDataset) -> None:
     before = cv2.getNumThreads()
     cv2.setNumThreads(3)

@@ -118,16 +118,20 @@ def _collate(samples: list[Sample | TriLiteNetError]) -> Batch | TriLiteNetError
 def _batches(
     loader: torch.utils.data.DataLoader[Batch | TriLiteNetError], plan: _Plan, batches: list[list[_Draw]]
 ) -> Iterator[Batch]:
-    """Yield the batches of a plan.
+    """Yield the batches of a plan. Workers serve one at a time: where another was begun meanwhile, they begin anew.
 
     Raises:
         RuntimeError: If a worker was killed; its text begins with `WORKER_LOST`.
     """
-    with _starting(loader.num_workers):
-        plan.batches = batches
-        following = iter(loader)
+    following: Iterator[Batch | TriLiteNetError] = iter(())
+    left: list[list[_Draw]] | None = None
     try:
-        for batch in following:
+        for number in range(len(batches)):
+            if plan.batches is not left:
+                plan.batches = left = batches[number:]
+                with _starting(loader.num_workers):
+                    following = iter(loader)
+            batch = next(following)
             if isinstance(batch, TriLiteNetError):
                 raise batch
             yield batch
