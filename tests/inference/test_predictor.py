@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -74,9 +76,13 @@ def test_a_list_is_batched_by_canvas_size_and_stays_in_order() -> None:
 
 def test_images_may_come_from_a_generator() -> None:
     predictor = Predictor(ColourBackend(), batch_size=2)
-    assert len(predictor(coloured_scene() for _ in range(3))) == 3  # type: ignore[call-overload]
-    with pytest.raises(ShapeError, match="got NoneType"):
-        predictor(None)  # type: ignore[call-overload]
+    assert len(predictor(coloured_scene() for _ in range(3))) == 3
+
+
+@pytest.mark.parametrize("image", [None, io.BytesIO(b"x"), bytearray(b"x"), memoryview(b"x")])
+def test_what_is_no_image_is_named_as_a_whole(image: Any) -> None:
+    with pytest.raises(ShapeError, match=f"PIL image or an array, got {type(image).__name__}"):
+        Predictor(ColourBackend())(image)
 
 
 def test_images_in_memory_may_come_one_by_one_each_with_its_source() -> None:

@@ -103,24 +103,25 @@ class Predictor:
     @overload
     def __call__(self, image: ImageLike) -> Perception: ...  # type: ignore[overload-overlap]  # text is a path
     @overload
-    def __call__(self, image: Sequence[ImageLike]) -> list[Perception]: ...
+    def __call__(self, image: Iterable[ImageLike]) -> list[Perception]: ...
 
-    def __call__(self, image: ImageLike | Sequence[ImageLike]) -> Perception | list[Perception]:
+    def __call__(self, image: ImageLike | Iterable[ImageLike]) -> Perception | list[Perception]:
         """Perceive one image or several.
 
         Args:
-            image: An `ImageLike` of any size, or a list of them (their sizes may differ).
+            image: An `ImageLike` of any size, or several, as a list or one by one (their sizes may differ).
 
         Returns:
-            A `Perception` for an image, a list of them for a list. Each keeps its source image, for drawing.
+            A `Perception` for an image, a list of them for several. Each keeps its source image, for drawing.
 
         Raises:
             InputError: If a file is missing, broken or no image.
-            ShapeError: If an array is of the wrong shape or type.
+            ShapeError: If it is something else, such as an open file, or an array of the wrong shape or type.
         """
         if isinstance(image, (str, Path, bytes, Image.Image, np.ndarray)):
             return self.perceive([read_image(image)], [_name(image)])[0]
-        if not isinstance(image, Iterable):
+        # Files and buffers give their lines and bytes one by one, which are no images.
+        if not isinstance(image, Iterable) or isinstance(image, (bytearray, memoryview)) or hasattr(image, "read"):
             raise ShapeError(f"an image is a path, bytes, a PIL image or an array, got {type(image).__name__}")
         images = list(image)
         return self.perceive([read_image(one) for one in images], [_name(one) for one in images])
