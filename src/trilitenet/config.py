@@ -229,7 +229,7 @@ class ModelCard:
         Raises:
             WeightsError: If it is not a card, or of a newer layout.
         """
-        return _read_versioned(cls, text, source, ("card", "card"), CARD_SCHEMA)
+        return _read_versioned(cls, text, source, "card", CARD_SCHEMA)
 
 
 CARD_KEY: Final = "trilitenet.card"
@@ -304,7 +304,7 @@ class ArtefactInfo:
         Raises:
             WeightsError: If it is not one, or of a newer layout.
         """
-        return _read_versioned(cls, text, source, ("description", "artefact"), ARTEFACT_SCHEMA)
+        return _read_versioned(cls, text, source, "artefact description", ARTEFACT_SCHEMA)
 
 
 _T = TypeVar("_T")
@@ -323,8 +323,9 @@ def parse(cls: type[_T], mapping: Mapping[str, Any], source: str) -> _T:
     Raises:
         ConfigError: On an unknown key (naming the nearest known one), a missing key or a value of the wrong type.
     """
+    _forbid_extra(cls)
     try:
-        result = _adapter(cls).validate_python(dict(mapping))
+        result = TypeAdapter(cls).validate_python(dict(mapping))
     except ValidationError as error:
         raise ConfigError(f"{source}: {_explain(cls, error)}") from error
     for path, given in _flags_for_numbers(result, mapping):
@@ -444,20 +445,12 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     return {str(key): value for key, value in content.items()}
 
 
-def _read_versioned(cls: type[_T], text: str, source: str, names: tuple[str, str], newest: int) -> _T:
-    """Read the JSON of a dataclass with a ``schema`` number, refusing a newer layout.
-
-    Args:
-        cls: The dataclass.
-        text: Its JSON.
-        source: The file it came from, for messages.
-        names: What messages call the JSON, and its schema.
-        newest: The highest schema this version reads.
+def _read_versioned(cls: type[_T], text: str, source: str, what: str, newest: int) -> _T:
+    """Read the JSON of a dataclass with a ``schema`` number, which messages call ``what``.
 
     Raises:
-        WeightsError: If it is not such JSON, or of a newer layout.
+        WeightsError: If it is not such JSON, or of a layout above ``newest``.
     """
-    what, schema_name = names
     try:
         mapping = parse_json(text)
     except (TypeError, ValueError) as error:  # the former of what is no text
@@ -471,22 +464,16 @@ def _read_versioned(cls: type[_T], text: str, source: str, names: tuple[str, str
     schema = mapping["schema"]
     if not isinstance(schema, int) or isinstance(schema, bool) or schema < 1:
         raise WeightsError(
-            f"{source}: {schema_name} schema must be a whole number from 1 on, got {schema!r}; the file is damaged"
+            f"{source}: {what} schema must be a whole number from 1 on, got {schema!r}; the file is damaged"
         )
     if schema > newest:
         raise WeightsError(
-            f"{source}: {schema_name} schema {schema!r} is newer than {newest}, which this version reads; "
-            "upgrade trilitenet"
+            f"{source}: {what} schema {schema!r} is newer than {newest}, which this version reads; upgrade trilitenet"
         )
     try:
         return parse(cls, mapping, source)
     except ConfigError as error:
         raise WeightsError(str(error)) from error
-
-
-def _adapter(cls: type[_T]) -> TypeAdapter[_T]:
-    _forbid_extra(cls)
-    return TypeAdapter(cls)
 
 
 def _forbid_extra(cls: type[Any]) -> None:
