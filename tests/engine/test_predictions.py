@@ -114,6 +114,14 @@ def test_broken_detections_are_told_in_a_line(tmp_path: Path, content: str, mess
         SavedPredictions(tmp_path, ("car", "bus"))
 
 
+def test_several_categories_of_one_class_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    entry = {"image_id": "a", "category_id": 3, "bbox": [0, 0, 9, 9], "score": 0.5}
+    for entries, told in (([entry], 0), ([entry, {**entry, "category_id": 8}], 1)):
+        (tmp_path / "detections.json").write_text(json.dumps(entries))
+        SavedPredictions(tmp_path, ("vehicle",))
+        assert caplog.text.count(f"boxes of {len(entries)} categories count as vehicle alike") == told
+
+
 def test_a_mark_before_the_list_is_no_part_of_it(tmp_path: Path) -> None:
     (tmp_path / "detections.json").write_text("\ufeff[]", encoding="utf-8")
     assert SavedPredictions(tmp_path, ("car",)).names == set()

@@ -15,6 +15,7 @@ from __future__ import annotations
 import array
 import contextlib
 import json
+import logging
 import math
 import re
 import shutil
@@ -33,6 +34,8 @@ from trilitenet.errors import DataError, OutputError, brief, part_of, writing
 from trilitenet.structures import Boxes, Perception
 
 __all__ = ["DETECTIONS_FILE", "PredictionWriter", "SavedPredictions"]
+
+_LOGGER: Final = logging.getLogger(__name__)
 
 DETECTIONS_FILE: Final = "detections.json"
 
@@ -194,10 +197,13 @@ class SavedPredictions:
     def _read_detections(self, path: Path) -> dict[str, Boxes]:
         numbers = array.array("d")  # an entry: image, left, top, right, bottom, score, class
         index: dict[str, int] = {}
+        categories: set[int] = set()
         try:
             for entry in _entries(path.read_text(encoding="utf-8-sig")):  # editors put a mark before it
                 left, top, width, height = (float(value) for value in entry["bbox"])
-                number = self._class(int(entry["category_id"]), path)
+                category = int(entry["category_id"])
+                categories.add(category)
+                number = self._class(category, path)
                 if not all(map(math.isfinite, (left, top, width, height))):
                     raise DataError(f"{path}: a bbox must be four numbers, got {entry['bbox']}")
                 score = float(entry["score"])
@@ -210,6 +216,11 @@ class SavedPredictions:
                 raise
             form = "a list of image_id, category_id, bbox, score"
             raise DataError(f"{path}: not COCO results ({form}): {brief(error)}") from error
+        if len(self.class_names) == 1 < len(categories):
+            _LOGGER.warning(
+                "%s: boxes of %d categories count as %s alike; if they are classes, name them with --classes",
+                path, len(categories), self.class_names[0],
+            )  # fmt: skip
         table = np.frombuffer(numbers, np.float64).reshape(-1, 7) if numbers else np.zeros((0, 7))
         table = table[np.lexsort((-table[:, 5], table[:, 0]))]
         parts = np.split(table, np.flatnonzero(np.diff(table[:, 0])) + 1) if len(table) else []
