@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.data.published import write_published
+from tests.data.published import write_annotation, write_published
 from trilitenet.data.loader import build_loader
 from trilitenet.data.prepared import PreparedDataset, open_dataset, prepare
 from trilitenet.data.reading import DrivingDataset
@@ -395,6 +395,11 @@ def test_classes_that_no_box_is_of_are_told(root: Path, tmp_path: Path, caplog: 
     assert not (root / ".prepared").exists()
     prepare(root, tmp_path / "own", canvas=CANVAS, splits=["val"])
     assert not caplog.text
-    describe(root, "classes: {zebra: [striped]}\n")
+    write_annotation(root, "val", "val_0000", [{"category": "Zebra", "box2d": {"x1": 1, "y1": 1, "x2": 9, "y2": 9}}])
+    describe(root, "classes: {car: [car], zebra: [zebra]}\n")
     prepare(root, tmp_path / "out", canvas=CANVAS, splits=["val"])
-    assert "the classes are zebra, the data hold" in caplog.text
+    assert "is of the class zebra, and those of Zebra are of none; say under classes: in dataset.yaml" in caplog.text
+    caplog.clear()
+    describe(root, "classes: {car: [car], zebra: [zebra]}\nignore: [Zebra]\n")
+    prepare(root, tmp_path / "ignored", canvas=CANVAS, splits=["val"])
+    assert not caplog.text

@@ -156,7 +156,7 @@ def prepare(
         )
     datasets = {split: DrivingDataset(root, split, class_names=names) for split in chosen}
     if class_names:
-        if without := set.intersection(*(dataset.classes_without_boxes() for dataset in datasets.values())):
+        if without := set.intersection(*(set(dataset.classes_without_boxes()[0]) for dataset in datasets.values())):
             raise DataError(
                 f"{root}: no box is of the class {', '.join(sorted(without))}; a folder to write goes before --classes"
             )

@@ -287,25 +287,19 @@ class DrivingDataset:
             digest.update(b"-" if data is None else hashlib.sha256(data.tobytes()).digest())
         return digest.hexdigest()[:16]
 
-    def foreign_categories(self) -> tuple[str, ...]:
-        """Return the categories of the boxes if none of them is in a class, else nothing; reads up to the first."""
-        found: set[str] = set()
+    def classes_without_boxes(self) -> tuple[list[str], set[str]]:
+        """Return the classes that no box is of, and the categories of the boxes; reads up to the first of each class.
+
+        Without any box both are empty.
+        """
+        without, found = dict(enumerate(self._class_names)), set[str]()
         for categories in self._categories():
             found |= categories
-            if found & self._table.keys():
-                return ()
-        return tuple(sorted(found))
-
-    def classes_without_boxes(self) -> set[str]:
-        """Return the classes that no box is of, none where there are no boxes; reads up to the first of each."""
-        without, boxes = dict(enumerate(self._class_names)), False
-        for categories in self._categories():
-            boxes = boxes or bool(categories)
             for category in categories & self._table.keys():
                 without.pop(self._table[category], None)
             if not without:
                 break
-        return set(without.values()) if boxes else set()
+        return list(without.values()) if found else [], found
 
     def _categories(self) -> Iterator[set[str]]:
         """Yield the categories of each image's boxes."""
@@ -320,14 +314,16 @@ class DrivingDataset:
                 continue  # told when the sample is read
 
     def warn_of_foreign(self) -> None:
-        """Warn if no box is of a class."""
-        if categories := self.foreign_categories():
+        """Warn of classes that no box is of, where boxes are of categories that mean nothing."""
+        without, found = self.classes_without_boxes()
+        foreign = sorted(found - self._table.keys() - set(self.description.ignore))
+        if without and foreign:
             _LOGGER.warning(
-                "no box of %s is of a class: the classes are %s, the data hold %s; say under classes: in dataset.yaml "
+                "no box of %s is of the class %s, and those of %s are of none; say under classes: in dataset.yaml "
                 "which categories make up a class",
                 self.root,
-                ", ".join(self.class_names),
-                ", ".join(categories[:10]) + (" and others" if len(categories) > 10 else ""),
+                ", ".join(without),
+                ", ".join(foreign[:10]) + (" and others" if len(foreign) > 10 else ""),
             )
 
     def __getitem__(self, index: int) -> Sample:
