@@ -132,6 +132,14 @@ def test_images_of_one_name_are_told_apart_by_their_folders(root: Path) -> None:
     assert [len(source.record("train", name).objects or ()) for name in ("one-c", "two-c")] == [1, 0]
 
 
+def test_label_files_of_no_image_are_told(root: Path) -> None:
+    for name in ("a", "classes"):
+        (root / f"labels/train/{name}.txt").write_text("")
+    assert read_yolo(root).found == ("train: 1 images", "val: 1 images")
+    (root / "labels/train/a-2.txt").write_text("")
+    assert read_yolo(root).found[-1] == f"1 label files are of no image, such as {root / 'labels/train/a-2.txt'}"
+
+
 def test_images_of_one_name_and_folder_are_refused(root: Path) -> None:
     cv2.imwrite(str(root / "images/train/a.png"), np.zeros((*SIZE, 3), np.uint8))
     with pytest.raises(DataError, match=r"two images are called 'a' in split 'train': .*a\.\w+ and .*a\.\w+; rename"):

@@ -155,6 +155,11 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
     mapping.check_categories(set(table.values()), path)
     found = [f"{split}: {len(items)} images" for split, items in images.items()]
     found += [f"{split}: {count} listed images are not there" for split, count in missing.items()]
+    labels = {_label_path(image): image for items in images.values() for image in items.values()}
+    folders = {path.parent for path, image in labels.items() if path.parent != image.parent}
+    stray = {path for folder in folders for path in folder.glob("*.txt") if path.name != "classes.txt"} - labels.keys()
+    if stray:
+        found.append(f"{len(stray)} label files are of no image, such as {min(stray)}")
     return YoloSource(path, dict(images), table, mapping, tuple(found))
 
 
