@@ -403,7 +403,7 @@ def _keep(
         with contextlib.closing(_open(trial, info)) as backend:
             parity = _compare(network, backend, info, checks)
         if parity.failures:
-            raise BackendError(f"{path}: not written, it differs from the network: {'; '.join(parity.failures)}")
+            raise BackendError(f"{path}: not written after comparison with the network: {'; '.join(parity.failures)}")
     return Exported(path, info, parity)
 
 
