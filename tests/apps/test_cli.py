@@ -406,3 +406,10 @@ def test_standard_streams_that_are_closed_or_full_are_no_tracebacks(
     assert done.returncode == code
     assert "Traceback" not in done.stderr
     assert told is None or done.stderr.endswith(told)
+
+
+def test_an_interruption_before_the_command_line_is_there_is_no_traceback(tmp_path: Path) -> None:
+    (tmp_path / "cyclopts.py").write_text("raise KeyboardInterrupt\n")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    done = subprocess.run([sys.executable, "-m", "trilitenet"], capture_output=True, text=True, env=environment)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "error: interrupted\n")
