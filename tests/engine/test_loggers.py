@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import errno
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -47,6 +49,30 @@ def test_tensorboard_writes_events(tmp_path: Path) -> None:
     logger.log({"train/total": 1.0}, 1)
     logger.close()
     assert list((tmp_path / "tensorboard").glob("events.*"))
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_disk_that_tensorboard_finds_full_is_told_by_the_next_call_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record_writer = pytest.importorskip("tensorboard.summary.writer.record_writer")
+    hook = threading.excepthook
+    (logger,) = build_loggers(["tensorboard"], tmp_path, {})
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(record_writer.RecordWriter, "write", full)
+    logger.log({"train/total": 1.0}, 1)
+    for thread in threading.enumerate():
+        if type(thread).__module__.startswith("tensorboard."):
+            thread.join()
+    with pytest.raises(OSError, match="No space left"):
+        logger.log({"train/total": 1.0}, 2)
+    with pytest.raises(OSError, match="No space left"):
+        logger.close()
+    assert capsys.readouterr().err == ""
+    assert threading.excepthook is hook
 
 
 @pytest.mark.parametrize("name", ["mlflow", "wandb"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -80,6 +81,8 @@ class TensorBoardLogger:
     def __init__(self, folder: Path, step: int = 0) -> None:
         module: Any = import_extra(*_PACKAGES["tensorboard"])
         self._writer = module.SummaryWriter(str(folder), purge_step=step + 1 if step else None)
+        self._hook = threading.excepthook
+        threading.excepthook = self._note
 
     def log(self, values: Mapping[str, float], step: int) -> None:
         """Take named figures of a step."""
@@ -88,7 +91,15 @@ class TensorBoardLogger:
 
     def close(self) -> None:
         """Write out what is left."""
-        self._writer.close()
+        try:
+            self._writer.close()
+        finally:
+            threading.excepthook = self._hook
+
+    def _note(self, failure: threading.ExceptHookArgs) -> None:
+        """Say nothing of what ends TensorBoard's thread, such as a full disk: the next call raises it."""
+        if not type(failure.thread).__module__.startswith("tensorboard."):
+            self._hook(failure)
 
 
 class MLflowLogger:
