@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import io
 import multiprocessing
@@ -30,6 +31,7 @@ from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.synthetic_files import write_dataset
 from trilitenet.engine import train as engine
 from trilitenet.engine.checkpoint import read_checkpoint, write_checkpoint
+from trilitenet.engine.ema import MovingAverage
 from trilitenet.engine.loggers import CsvLogger, read_csv
 from trilitenet.engine.predictions import PredictionWriter
 from trilitenet.engine.recipe import read_recipe
@@ -675,36 +677,94 @@ def test_an_image_that_vanishes_or_breaks_is_named_and_the_run_can_go_on(
     assert train(resume=True, **options | {"max_steps": steps + 1}).steps == steps + 1
 
 
-def test_a_reading_process_that_is_killed_while_a_checkpoint_is_written_is_told_as_such(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    train(**settings(scenes, tmp_path, max_steps=1))
-
-    def save(*_: object) -> None:
-        raise RuntimeError("DataLoader worker (pid 7) is killed by signal: Killed. ")
-
-    monkeypatch.setattr(torch, "save", save)
-    with pytest.raises(TrainingError, match=r"reads images was ended .*--workers .*--resume"):
-        train(resume=True, **settings(scenes, tmp_path, max_steps=2))
-    monkeypatch.undo()
-    assert state(tmp_path)["step"] == 1
-
-
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # PyTorch's, which the news interrupts at times
-def test_a_reading_process_that_is_killed_is_told_in_one_line(
+def test_a_reading_process_that_is_killed_in_the_middle_of_a_step_costs_none(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    others, plain = set(multiprocessing.active_children()), CsvLogger.log
+    options = {"workers": 1, "max_steps": 4, "samples_per_epoch": 40}
+    others, plain = set(multiprocessing.active_children()), MovingAverage.update
+
+    def update(self: MovingAverage, network: TriLiteNet) -> None:
+        if self.updates == 1:  # the optimiser has stepped, the average has not
+            (worker,) = set(multiprocessing.active_children()) - others
+            worker.kill()
+            os.waitid(os.P_PID, int(worker.pid or 0), os.WEXITED | os.WNOWAIT)
+        plain(self, network)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MovingAverage, "update", update)
+        with pytest.raises(
+            TrainingError, match=r"reads images was ended .*--workers; --resume goes on after step 2"
+        ) as e:
+            train(**logged(scenes, tmp_path / "parts", **options))
+    assert "\n" not in str(e.value)
+    assert train(resume=True, **logged(scenes, tmp_path / "parts", **options)).finished
+    train(**logged(scenes, tmp_path / "straight", **options))
+    same(state(tmp_path / "straight"), state(tmp_path / "parts"))
+    assert curves(tmp_path / "straight") == curves(tmp_path / "parts")
+
+
+@pytest.mark.parametrize(("writable", "kept"), [(False, 2), (True, 4)])
+def test_best_weights_that_cannot_be_written_cost_no_more_than_the_checkpoint(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, writable: bool, kept: int
+) -> None:
+    """A disk that is full from the end of the second epoch on, at last for weights alone."""
+    figures = iter([0.1, 0.2, 0.2, 0.1, 0.3])
+    monkeypatch.setattr("trilitenet.commands.train.validation_figures", lambda *_: {"drivable/miou": next(figures)})
+    run = settings(scenes, tmp_path, val_split="val", tasks=("drivable",), max_steps=8, patience=2)
+
+    def full(path: Path, *_: Any) -> None:
+        raise OutputError(f"{path.name}: No space left on device")
+
+    def weights(network: TriLiteNet, path: Path, card: Any) -> None:
+        full(path) if card.provenance["steps"] == "4" else save_network(network, path, card)
+
+    def checkpoint(path: Path, state: dict[str, Any]) -> None:
+        full(path) if state["step"] == 4 and not writable else write_checkpoint(path, state)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(engine, "save_network", weights)
+        patch.setattr(engine, "write_checkpoint", checkpoint)
+        told = rf"^best-drivable\.saf.* mended, --resume goes on after step {kept} of 8 \(epoch {kept // 2} of 10\)$"
+        with pytest.raises(OutputError, match=told):
+            train(**run)
+    assert state(tmp_path)["step"] == kept
+    result = train(resume=True, **run)
+    assert (result.steps, result.best["drivable"]) == (8, 0.3)
+    assert read_card(tmp_path / "best-drivable.safetensors").metrics["best drivable"] == 0.3
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is full")
+def test_a_log_that_cannot_be_written_is_told_once(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = CsvLogger.log
 
     def log(self: CsvLogger, values: Any, step: int) -> None:
+        if step == 3:
+            self._file.close()
+            self._file = Path("/dev/full").open("w")  # noqa: SIM115 - closing it fails, too
+            self._writer = csv.writer(self._file)
         plain(self, values, step)
-        for worker in set(multiprocessing.active_children()) - others if step == 3 else ():
-            worker.kill()
 
     monkeypatch.setattr(CsvLogger, "log", log)
-    with pytest.raises(TrainingError, match=r"reads images was ended .*--workers .*--resume") as caught:
-        train(**logged(scenes, tmp_path, max_steps=30, workers=1, samples_per_epoch=400))
-    assert "\n" not in str(caught.value)
+    with pytest.raises(
+        OutputError, match=r"cannot be written \(No space .* mended, --resume goes on after step 3 of 6"
+    ):
+        train(**logged(scenes, tmp_path, max_steps=6))
+
+
+def test_a_disk_that_is_full_from_the_start_is_told_as_such(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, _: Any) -> None:
+        raise OutputError(f"{path}: cannot write the checkpoint (No space left on device)")
+
+    monkeypatch.setattr(engine, "write_checkpoint", full)
+    with pytest.raises(
+        OutputError, match=r"once that is mended, start anew with --overwrite, for nothing is saved yet"
+    ):
+        train(**settings(scenes, tmp_path, max_steps=1))
 
 
 def test_resuming_takes_the_anchors_for_distillation_too(

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from trilitenet.data.loader import WORKER_LOST
 from trilitenet.engine.checkpoint import (
     CHECKPOINT_SCHEMA,
     random_state,
@@ -64,19 +63,6 @@ def test_a_checkpoint_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monk
     monkeypatch.setattr("os.fsync", lambda number: named.append(path.exists()))
     write_checkpoint(path, whole())
     assert named == [False]
-
-
-def test_a_worker_that_was_killed_meanwhile_is_no_fault_of_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def save(*arguments: object) -> None:
-        raise RuntimeError(f"{WORKER_LOST} (pid 7) is killed by signal: Killed.")
-
-    monkeypatch.setattr("torch.save", save)
-    with pytest.raises(RuntimeError, match=r"\(pid 7\) is killed") as caught:
-        write_checkpoint(tmp_path / "last.ckpt", whole())
-    assert not isinstance(caught.value, OutputError)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_killed_in_the_middle_of_writing_leaves_the_old_one(tmp_path: Path) -> None:

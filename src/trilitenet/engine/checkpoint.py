@@ -11,7 +11,6 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from trilitenet.data.loader import WORKER_LOST
 from trilitenet.errors import OutputError, WeightsError, replacing
 
 __all__ = ["CHECKPOINT_SCHEMA", "random_state", "read_checkpoint", "set_random_state", "write_checkpoint"]
@@ -42,7 +41,6 @@ def write_checkpoint(path: str | Path, state: dict[str, Any]) -> None:
 
     Raises:
         OutputError: If it cannot be written.
-        RuntimeError: If a worker of a loader is killed meanwhile; its text begins with `WORKER_LOST`.
     """
     path = Path(path)
     try:
@@ -52,8 +50,6 @@ def write_checkpoint(path: str | Path, state: dict[str, Any]) -> None:
             file.flush()
             os.fsync(file.fileno())
     except (OSError, RuntimeError) as error:
-        if str(error).startswith(WORKER_LOST):
-            raise
         # Where the disk is full, PyTorch's own error comes on top of the one that says so.
         reason = error.__context__ if isinstance(error.__context__, OSError) else error
         raise OutputError(f"{path}: cannot write the checkpoint ({reason})") from error

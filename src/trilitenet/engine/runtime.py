@@ -11,7 +11,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from types import FrameType, TracebackType
 from typing import Any, Final
 
@@ -21,7 +21,7 @@ from trilitenet.errors import BackendError, ConfigError, TrainingError, TriLiteN
 from trilitenet.processing.cores import usable_cores
 from trilitenet.processing.memory import STEPS, keep_freed_memory
 
-__all__ = ["RESUME", "StopRequest", "follow", "pick_precision", "running_fabric"]
+__all__ = ["StopRequest", "follow", "pick_precision", "putting_off", "running_fabric"]
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +34,7 @@ _GRACE: Final = 10.0
 _ERROR_KEY: Final = "trilitenet/error"
 """Where, in the store that the processes share, one says why it ends."""
 
-RESUME: Final = "--resume goes on from the last checkpoint"
+_GO_ON: Final = "--resume goes on from the last checkpoint"
 
 
 def pick_precision(precision: str, device: str) -> str:
@@ -226,12 +226,12 @@ class _Others:
                 code = process.poll() or 0
                 if code < 0:
                     return (
-                        f"process {rank} was killed ({signal.Signals(-code).name}), mostly for want of memory; {RESUME}"
+                        f"process {rank} was killed ({signal.Signals(-code).name}), mostly for want of memory; {_GO_ON}"
                     )
                 if code:
-                    return f"process {rank} ended with exit code {code}, see what it said above; {RESUME}"
+                    return f"process {rank} ended with exit code {code}, see what it said above; {_GO_ON}"
             time.sleep(0.1 if self._processes else 0.0)
-        return f"another process of the run has gone, perhaps one of another machine; {RESUME}"
+        return f"another process of the run has gone, perhaps one of another machine; {_GO_ON}"
 
     def join(self) -> None:
         """Wait for their end."""
@@ -302,3 +302,37 @@ class StopRequest:
             raise KeyboardInterrupt
         self.signal = number
         log.warning("%s: stopping after this step, with a checkpoint", signal.Signals(number).name)
+
+
+@contextlib.contextmanager
+def putting_off(name: str) -> Iterator[Callable[[], contextlib.AbstractContextManager[None]]]:
+    """Let Python's handler of a signal, if the system has it, wait for the blocks of what is yielded.
+
+    In the main thread; elsewhere Python calls none.
+    """
+    number = getattr(signal, name, None)
+    if number is None or threading.current_thread() is not threading.main_thread():
+        yield contextlib.nullcontext
+        return
+    came: list[tuple[int, FrameType | None]] = []
+
+    def note(*news: Any) -> None:
+        came.append(news)
+
+    handler = signal.signal(number, note)
+
+    @contextlib.contextmanager
+    def heeding() -> Iterator[None]:
+        nonlocal handler
+        signal.signal(number, handler)
+        try:
+            if came and callable(handler):
+                handler(*came.pop())
+            yield
+        finally:
+            handler = signal.signal(number, note)  # which may be another by now
+
+    try:
+        yield heeding
+    finally:
+        signal.signal(number, handler)

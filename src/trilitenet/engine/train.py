@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import logging
@@ -27,9 +28,18 @@ from trilitenet.engine.loggers import RunLogger
 from trilitenet.engine.optim import Schedule, build_optimiser
 from trilitenet.engine.recipe import TrainConfig
 from trilitenet.engine.rescale import draw_size, rescale
-from trilitenet.engine.runtime import RESUME, StopRequest
+from trilitenet.engine.runtime import StopRequest, putting_off
 from trilitenet.engine.transfer import keep_frozen
-from trilitenet.errors import ConfigError, DataError, TrainingError, WeightsError, brief, write_file, writing
+from trilitenet.errors import (
+    ConfigError,
+    DataError,
+    OutputError,
+    TrainingError,
+    WeightsError,
+    brief,
+    write_file,
+    writing,
+)
 from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.losses.multitask import LossTerms, MultiTaskLoss
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
@@ -228,6 +238,10 @@ class Trainer:
         """Step at which an epoch was last validated and saved, for a stop comes between it and its last step."""
         self._ahead: dict[str, float] = {}
         """What the files of best weights reached that are newer than the checkpoint."""
+        self._saved: int | None = None
+        """Step that the checkpoint in the folder is of."""
+        self._heeding: Callable[[], contextlib.AbstractContextManager[None]] = contextlib.nullcontext
+        """In its blocks alone PyTorch raises that a process that reads images was killed, which it does anywhere."""
         self.seconds = 0.0
         self.images = 0
 
@@ -259,12 +273,14 @@ class Trainer:
                     _forget(self.folder)
                 write_file(self.folder / "config.yaml", yaml.safe_dump(self.config.to_dict(), sort_keys=False))
                 self.loggers = build_loggers(self.step)
+        weights = self.folder / "final.safetensors"
         try:
-            finished = self._run()
-        except DataError as error:
-            self.guard.look()
-            self.save()  # it came between two steps
-            raise DataError(f"{error}; once that is mended, {RESUME}") from error
+            with self._logging():
+                finished = self._run()
+            if finished and self.fabric.is_global_zero:
+                save_network(self.averaged, weights, self._card())
+        except (DataError, OutputError) as error:  # it came between two steps
+            raise type(error)(f"{error}; once that is mended, {self._keep()}") from error
         except RuntimeError as error:
             if isinstance(error, torch.OutOfMemoryError) or _NO_MEMORY in str(error):
                 height, width = self.config.input_size
@@ -277,14 +293,8 @@ class Trainer:
                 raise
             raise TrainingError(
                 f"a process that reads images was ended ({' '.join(str(error).split())}), mostly for want of memory; "
-                f"lower --workers or --batch-size; {RESUME}"
+                f"lower --workers; {self._keep()}"
             ) from error
-        finally:
-            for logger in self.loggers:
-                logger.close()
-        weights = self.folder / "final.safetensors"
-        if finished and self.fabric.is_global_zero:
-            save_network(self.averaged, weights, self._card())
         self.fabric.barrier()
         speed = self.images / self.seconds if self.seconds else 0.0
         first = self.fabric.is_global_zero
@@ -292,7 +302,7 @@ class Trainer:
 
     def _run(self) -> bool:
         """Run the epochs; return whether the end was reached, by schedule or by early stopping."""
-        with StopRequest() as stop:
+        with StopRequest() as stop, putting_off("SIGCHLD") as self._heeding:
             if self.ended < self.step and (self.step % self.epoch_steps == 0 or self.step >= self.steps):
                 self._end_epoch((self.step - 1) // self.epoch_steps, stop)
             while self.step < self.steps and not self._stopped(stop) and not self._stalled():
@@ -303,6 +313,30 @@ class Trainer:
                 self._end_epoch(epoch, stop)
             self.save()
             return not self._stopped(stop)
+
+    def _keep(self) -> str:
+        """Save the state if that can be done; return how to go on."""
+        self.guard.look()
+        with contextlib.suppress(OutputError):
+            self.save()
+        if self._saved is None:
+            return "start anew with --overwrite, for nothing is saved yet"
+        epoch = math.ceil(self._saved / self.epoch_steps)
+        return f"--resume goes on after step {self._saved} of {self.steps} (epoch {epoch} of {self.config.epochs})"
+
+    @contextlib.contextmanager
+    def _logging(self) -> Iterator[None]:
+        """Close the loggers at the end."""
+        try:
+            yield
+        except BaseException:
+            for logger in self.loggers:
+                with contextlib.suppress(OSError):  # of which what is told already may be the cause
+                    logger.close()
+            raise
+        with writing(self.folder):
+            for logger in self.loggers:
+                logger.close()
 
     @property
     def averaged(self) -> TriLiteNet:
@@ -335,13 +369,15 @@ class Trainer:
 
         Raises:
             DataError: If an image or label cannot be read by any of the processes: the first one is to save.
+            RuntimeError: If a worker of any was killed, likewise; its text begins with `WORKER_LOST`.
         """
         group: list[Batch] = []
-        failed: DataError | None = None
+        failed: DataError | RuntimeError | None = None
         try:
             if not stop and self.step < self.steps:
-                group = list(itertools.islice(batches, self.config.accumulate))
-        except DataError as error:
+                with self._heeding():
+                    group = list(itertools.islice(batches, self.config.accumulate))
+        except (DataError, RuntimeError) as error:
             failed = error
         asked, broken = self._any(bool(stop), failed is not None)
         if broken:
@@ -433,16 +469,15 @@ class Trainer:
         scores = {task: value for task, value in scores.items() if math.isfinite(value)}
         if scores:
             scores["overall"] = sum(scores.values()) / len(scores)
-        self.stale += 1
-        for name, value in scores.items():
-            if value > self.best.get(name, -math.inf):
-                self.best[name] = value
-                self.stale = 0 if name == "overall" else self.stale
-                # A better file that is newer than the checkpoint is made again by a step that is yet to be run again.
-                if value >= self._ahead.get(name, -math.inf):
-                    card = self._card()
-                    card = dataclasses.replace(card, metrics={**card.metrics, f"best {name}": value})
-                    save_network(self.averaged, self._best_path(name), card)
+        better = {name: value for name, value in scores.items() if value > self.best.get(name, -math.inf)}
+        for name, value in better.items():
+            # A better file that is newer than the checkpoint is made again by a step that is yet to be run again.
+            if value >= self._ahead.get(name, -math.inf):
+                card = self._card()
+                card = dataclasses.replace(card, metrics={**card.metrics, f"best {name}": value})
+                save_network(self.averaged, self._best_path(name), card)
+        self.best |= better  # not before the files are whole: after a full disk all of this is done anew
+        self.stale = 0 if "overall" in better else self.stale + 1
 
     def _best_path(self, name: str) -> Path:
         return self.folder / f"best-{name}.safetensors"
@@ -518,6 +553,7 @@ class Trainer:
                 "random": random_state(),
             },
         )
+        self._saved = self.step
 
     def load(self, path: str | Path) -> None:
         """Take over the state of a checkpoint.
@@ -554,6 +590,7 @@ class Trainer:
         except (RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
             reason = brief(error)[:200]  # of a network it names every tensor
             raise WeightsError(f"{path}: does not fit this run ({reason}); start anew with --overwrite") from error
+        self._saved = self.step
         self._read_best()
         self.guard.look()
 
