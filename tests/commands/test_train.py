@@ -147,10 +147,13 @@ def test_resuming_takes_the_new_weight_decay(scenes: Path, tmp_path: Path) -> No
     assert {tuple(group["betas"]) for group in groups} == {(0.5, 0.6)}
 
 
-def test_what_no_image_is_labelled_for_is_told(scenes: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_has_no_effect_is_told(scenes: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     data = shutil.copytree(scenes, tmp_path / "data")
     shutil.rmtree(data / "ll_seg_annotations" / "train")
-    train(**settings(data, tmp_path / "run", max_steps=1, classes=("vehicel",), sampling={"timeofdy": {"night": 2.0}}))
+    more: dict[str, Any] = {"classes": ("vehicel",), "sampling": {"timeofdy": {"night": 2.0}}}
+    train(**settings(data, tmp_path / "run", max_steps=1, swapped_anchors=True, patience=2, **more))
+    assert "swapped_anchors changes nothing without auto_anchor" in caplog.text
+    assert "patience stops nothing without val_split" in caplog.text
     assert "no image of train is labelled for lane" in caplog.text
     assert "no box of" in caplog.text
     assert "no image has the attribute 'timeofdy' to sample by; did you mean 'timeofday'?" in caplog.text

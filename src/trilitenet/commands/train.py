@@ -110,6 +110,10 @@ def train(
 def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: bool) -> TrainResult:
     """Train as one of the processes of a run."""
     folder = Path(config.output)
+    if config.swapped_anchors and not config.auto_anchor:
+        _LOGGER.warning("swapped_anchors changes nothing without auto_anchor, which fits them")
+    if config.patience and not config.val_split:
+        _LOGGER.warning("patience stops nothing without val_split, whose figures it watches")
     torch.manual_seed(config.seed)
     with _display(quiet=not fabric.is_global_zero) as display:
         dataset = training_data(config)
