@@ -155,6 +155,11 @@ def test_photos_of_phones_are_named_with_the_cure() -> None:
         read_image(b"\0\0\0\x18ftypheic" + bytes(100))
 
 
+def test_an_image_without_pixels_is_refused() -> None:
+    with pytest.raises(InputError, match="the image: has no pixels"):
+        read_image(Image.new("RGB", (0, 4)))
+
+
 @pytest.mark.parametrize("image", [None, 3, bytearray(b"x"), object()])
 def test_what_is_no_image_is_refused(image: Any) -> None:
     with pytest.raises(ShapeError, match="an image is a path, bytes, a PIL image or an array"):

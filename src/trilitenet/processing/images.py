@@ -117,6 +117,8 @@ def _decode(image: Image.Image, name: str) -> NDArray[np.uint8]:
         image.load()
         turned = _orientation(image)
         width, height = image.size
+        if not width or not height:
+            raise InputError(f"{name}: has no pixels")
         array = np.empty((width, height, 3) if turned in _SIDEWAYS else (height, width, 3), np.uint8)
         rows = _TURNS[turned](array) if turned in _TURNS else array
         if image.mode in {"I", "F"}:
