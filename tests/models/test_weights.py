@@ -66,6 +66,14 @@ def test_round_trip(tmp_path: Path, classes: int, tasks: tuple[str, ...], blocks
                 assert torch.equal(got, expected)
 
 
+def test_loading_takes_nothing_from_a_seeded_run(saved: Path) -> None:
+    torch.manual_seed(1)
+    expected = torch.rand(1)
+    torch.manual_seed(1)
+    load_network(saved)
+    assert torch.rand(1) == expected
+
+
 def test_what_is_saved_is_what_the_network_is(tmp_path: Path) -> None:
     network = build_network("tiny")
     network.anchors.mul_(2)  # as fitted to a data set, after the card was written

@@ -179,7 +179,8 @@ def load_network(path: str | os.PathLike[str]) -> TriLiteNet:
     path = resolve_weights(path)
     card, tensors = _open(path, tensors=True)
     blocks = {name: name in card.blocks for name in ("pcaa", "litepan", "spp")}
-    network = build_network(card.variant, card.classes, card.tasks, anchors=card.anchors, **blocks)
+    with torch.random.fork_rng(devices=()):  # the random weights that are replaced take nothing from a seeded run
+        network = build_network(card.variant, card.classes, card.tasks, anchors=card.anchors, **blocks)
     _load_strictly(network, tensors, str(path))
     network.card = card
     return network.eval()
