@@ -290,6 +290,16 @@ def test_a_frame_after_the_end_is_refused(tmp_path: Path) -> None:
     assert (tmp_path / "a.mp4").exists()
 
 
+def test_a_frame_that_is_no_picture_takes_nothing_from_the_video(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "a.mp4") as writer:
+        writer.write(coloured_scene(32, 32))
+        for wrong in (np.zeros((32, 32, 3)), np.zeros((32, 32, 2), np.uint8), np.zeros((0, 32, 3), np.uint8)):
+            with pytest.raises(ShapeError, match="an image must be"):
+                writer.write(wrong)  # type: ignore[arg-type]
+        writer.write(coloured_scene(32, 32)[..., 0])
+    assert [frame.index for frame in VideoReader(tmp_path / "a.mp4")] == [0, 1]
+
+
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     writer = VideoWriter(tmp_path / "file" / "a.mp4")

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from trilitenet.errors import InputError, OutputError, ShapeError, import_extra, part_of
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Failure, Frame, FrameReader, Stills
+from trilitenet.processing.images import to_rgb
 from trilitenet.structures import Perception
 
 __all__ = ["PerceptionStream", "Prefetch", "VideoWriter"]
@@ -258,17 +259,19 @@ class VideoWriter:
         """Add a frame. The array must not be changed afterwards.
 
         Args:
-            image: (height, width, 3) uint8 RGB; brought to the size of the first frame if it differs.
+            image: (height, width, 3) uint8 RGB, or what else `to_rgb` takes; brought to the size of the first frame if
+                it differs.
             timestamp: Seconds from the start; by the frame rate if left out.
 
         Raises:
+            ShapeError: If it is no such image, which takes nothing from the video.
             OutputError: If the file cannot be written, at this frame or a later one; or if the writer was closed.
         """
         if self._error is not None:
             raise self._error
         if self._closed:
             raise OutputError(f"{self.path}: the video was closed")
-        self._waiting.put((image, self.frames / self._rate if timestamp is None else timestamp))
+        self._waiting.put((to_rgb(image), self.frames / self._rate if timestamp is None else timestamp))
         self.frames += 1
 
     def close(self) -> None:
