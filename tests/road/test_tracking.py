@@ -127,6 +127,12 @@ def test_smoothing_follows_a_lasting_change_and_a_new_size() -> None:
         MaskSmoother(1.0)
 
 
+def test_masks_may_lie_column_by_column(rng: np.random.Generator) -> None:
+    rows, columns = MaskSmoother(0.7), MaskSmoother(0.7)
+    for mask in rng.random((4, 6, 5)) > 0.5:
+        np.testing.assert_array_equal(columns.update(np.asfortranarray(mask)), rows.update(mask))
+
+
 def test_steady_leaves_absent_tasks_absent() -> None:
     perception = Steady(smoothing=0.5)(Perception((4, 6)))
     assert perception.boxes is None

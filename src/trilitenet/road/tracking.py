@@ -149,7 +149,7 @@ class MaskSmoother:
         if self.strength == 0.0:
             return mask
         if self._mean is None or self._mean.shape != mask.shape:
-            self._mean = current.astype(np.float32)
+            self._mean = current.astype(np.float32, order="C")  # rows first, for OpenCV
             return mask
         cv2.accumulateWeighted(current, self._mean, 1.0 - self.strength)
         return np.asarray(self._mean > 0.5)
