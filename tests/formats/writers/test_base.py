@@ -75,6 +75,14 @@ def test_all_frames_of_a_video_go_into_the_same_files(format_name: str, tmp_path
     assert len(writer.files) in {1, 2, 301}
 
 
+def test_nothing_is_taken_after_the_end(format_name: str, tmp_path: Path, pictures: list[Perception]) -> None:
+    with open_writer(format_name, tmp_path) as writer:
+        writer.write(pictures[0])
+    with pytest.raises(OutputError, match="the writer was closed"):
+        writer.write(pictures[1])
+    writer.close()
+
+
 def test_unknown_format_names_the_nearest(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="did you mean 'openlabel'"):
         open_writer("openlable", tmp_path)

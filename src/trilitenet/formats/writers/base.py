@@ -81,6 +81,7 @@ class Writer(abc.ABC):
         self._unnamed = 0
         self._empty = True
         self._broken = False
+        self._closed = False
 
     def write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
         """Write one image or frame.
@@ -91,8 +92,11 @@ class Writer(abc.ABC):
                 leaves it out.
 
         Raises:
-            OutputError: If a file exists and may not be replaced, or cannot be written, or an earlier one could not.
+            OutputError: If a file exists and may not be replaced, or cannot be written, or an earlier one could not; or
+                if the writer was closed.
         """
+        if self._closed:
+            raise OutputError(f"{self.output}: the writer was closed")
         if self._broken:
             raise OutputError(f"{self.output}: a result could not be written, and what followed it would have a gap")
         with uninterrupted():
@@ -108,6 +112,7 @@ class Writer(abc.ABC):
 
         If nothing was written, files that exist stay as they are.
         """
+        self._closed = True
         with uninterrupted():
             self._close()
 
