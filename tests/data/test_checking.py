@@ -305,6 +305,17 @@ def test_copies_are_found_among_many_pictures_of_one_hash() -> None:
     assert (finding.count, finding.examples) == (1, ("val/1 ~ train/1",))
 
 
+def test_a_condition_that_an_image_lacks_is_undefined(root: Path) -> None:
+    index = root / "index.csv"
+    lines = index.read_text(encoding="utf-8").splitlines()
+    rows = [f"{line},{'' if number % 2 else 'rain'}" for number, line in enumerate(lines[1:])]
+    index.write_text("\n".join([f"{lines[0]},weather", *rows]), encoding="utf-8")
+    assert check_dataset(root).conditions["weather"] == {
+        "rain": {"train": 15, "val": 5},
+        "undefined": {"train": 15, "val": 5},
+    }
+
+
 def test_labels_of_tasks_that_are_not_labelled_at_all_do_not_count(root: Path) -> None:
     (root / "dataset.yaml").write_text("tasks: [lane]\n")
     truncate(root / "da_seg_annotations/train/train_0001.png")

@@ -581,7 +581,7 @@ def _conditions(facts: dict[str, list[_Facts]], index: list[dict[str, str]]) -> 
             row = rows.get((split, fact.name), {})
             for key, value in {**fact.attributes, **row}.items():
                 if key not in {"name", "split"}:
-                    table[key][value][split] += 1
+                    table[key][value or "undefined"][split] += 1  # as the evaluation calls it
     total = sum(map(len, facts.values()))
     limit = max(2, min(40, total // 3))
     return {
