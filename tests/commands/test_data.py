@@ -53,6 +53,17 @@ def test_convert_both_ways(raw: Path, tmp_path: Path, capsys: pytest.CaptureFixt
         assert path.read_bytes() == (tmp_path / "two" / path.relative_to(tmp_path / "one")).read_bytes()
 
 
+def test_convert_says_that_lane_masks_keep_their_width(raw: Path, tmp_path: Path) -> None:
+    said = "lane masks keep the width they are drawn in; --lane-width is for lines"
+    assert said not in convert("bdd100k", raw, tmp_path / "lines", workers=1).summary()
+    (raw / "labels/lane/polygons/lane_train.json").unlink()
+    (raw / "labels/lane/masks/train").mkdir(parents=True)
+    cv2.imwrite(str(raw / "labels/lane/masks/train/a1.png"), np.full(raw_bdd.SIZE, 255, np.uint8))
+    shown = convert("bdd100k", raw, tmp_path / "masks", lane_width=["20"], workers=1).summary()
+    assert said in shown
+    assert "1 masks" in shown
+
+
 def test_convert_options(raw: Path, tmp_path: Path) -> None:
     (tmp_path / "classes.yaml").write_text("classes: {small: [car], large: [bus, truck]}\nlicence: mine\n")
     words = ["--classes", str(tmp_path / "classes.yaml"), "--lane-width", "train=40", "--max-gap", "100", "--crosswalk",

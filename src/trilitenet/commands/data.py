@@ -79,6 +79,8 @@ class Converted:
         for split in self.report.images:
             table.add_row(*_counts(self.report, split), _listed(self.report.lanes[split]))
         lines = [*self.found, _rendered(table)]
+        if any("masks" in lanes for lanes in self.report.lanes.values()):
+            lines.append("lane masks keep the width they are drawn in; --lane-width is for lines")
         for split, reasons in self.report.dropped.items():
             lines += [f"{split}: left out {count} x {reason}" for reason, count in reasons.items()]
         return "\n".join([*lines, f"written to {self.output}"])
@@ -118,7 +120,7 @@ def convert(
             other names and mask values mean; see docs/data.md.
         splits: Convert these splits alone.
         lane_width: Width of lane markings in pixels of a 1280-pixel wide image, for all splits (``4``) or one
-            (``train=8``); 8 for train and 2 for others if left out.
+            (``train=8``); 8 for train and 2 for others if left out. Markings that come as masks keep theirs.
         crosswalk: Draw crosswalks as lane markings.
         vertical: Draw markings across the road (stop lines) as lane markings.
         pair_edges: Join the two edges that BDD100K draws of a marking into its centre line.

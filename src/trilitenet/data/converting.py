@@ -125,7 +125,8 @@ class ConversionReport:
         images: Split -> images written.
         labelled: Split -> task -> images labelled for it.
         objects: Split -> class (or ``ignored``) -> boxes written.
-        lanes: Split -> ``"pairs"``, ``"single lines"`` -> lane markings drawn.
+        lanes: Split -> ``"pairs"``, ``"single lines"``, ``"outlines"`` -> lane markings drawn; ``"masks"`` -> images
+            whose markings came as a mask, which keeps its width.
         dropped: Split -> reason -> how many labels, or images, were left out.
     """
 
@@ -405,6 +406,7 @@ def _convert_one(record: ImageRecord, split: str, root: Path, options: Conversio
     if record.lane is not None:
         if isinstance(record.lane, MaskFile):
             mask = _mask_of(record.lane, size, keep_alternative=False)
+            summary["lanes"] = {"masks": 1}
         else:
             mask, drawn, left_out = lane_mask(record.lane, size, options.width(split), options)
             dropped += left_out

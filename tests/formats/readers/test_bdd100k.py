@@ -111,9 +111,10 @@ def test_lane_masks_of_2020_are_read_where_there_are_no_polygons(tmp_path: Path)
     mask[2] = 6 | 16  # single white, dashed
     mask[3] = 6 | 32  # single white across the road
     cv2.imwrite(str(folder / "a1.png"), mask)
-    convert(read_bdd100k(raw), tmp_path / "out")
+    report = convert(read_bdd100k(raw), tmp_path / "out")
     lane = cv2.imread(str(tmp_path / "out/ll_seg_annotations/train/a1.png"), cv2.IMREAD_UNCHANGED)
     assert np.flatnonzero(np.asarray(lane).any(axis=1)).tolist() == [2]
+    assert report.lanes["train"] == {"masks": 1}
 
 
 def test_index_of_a_large_file_survives_chunk_borders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
