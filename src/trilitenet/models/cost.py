@@ -1,4 +1,7 @@
-"""Parameters and multiply-adds, counted as the paper's cost table does (Section IV-B-3)."""
+"""Parameters and multiply-adds, the columns of the paper's cost table (Sections IV-A-3 and IV-B-1).
+
+The paper's figures ("FLOPs") count element-wise layers besides, so they are somewhat higher (docs/network.md).
+"""
 
 from __future__ import annotations
 
