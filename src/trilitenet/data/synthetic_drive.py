@@ -28,18 +28,16 @@ _CHUNK: Final = 150.0
 class SyntheticDrive:
     """The frames of a drive in the middle one of three lanes.
 
-    There is a vehicle ahead, which the ego vehicle closes on; a change to the lane on the left; a second vehicle ahead
-    there; and traffic on the other lanes and against.
+    There is a vehicle ahead, which the ego vehicle closes on; a change to the lane on the left at 45% of the drive; a
+    second vehicle ahead there; and traffic on the other lanes and against.
 
     Args:
         seed: Another seed gives another road, light and traffic.
         frames: How many frames.
         fps: Frames a second.
         size: (height, width) in pixels.
-        camera: The camera; a common dashboard camera if left out. Its size overrides ``size``.
         time: Time of day.
         weather: The weather.
-        lane_change: The ego vehicle changes lanes at 45% of the drive.
         faults: Add the noise and blur of a cheap camera.
     """
 
@@ -49,17 +47,15 @@ class SyntheticDrive:
         frames: int = 1500,
         fps: float = 25.0,
         size: tuple[int, int] = (720, 1280),
-        camera: Camera | None = None,
         *,
         time: Literal["day", "dusk", "night"] = "day",
         weather: Literal["clear", "overcast", "rain", "fog"] = "clear",
-        lane_change: bool = True,
         faults: bool = True,
     ) -> None:
         if frames < 1 or fps <= 0:
             raise ConfigError(f"a drive needs at least one frame and a positive rate, got {frames} and {fps}")
         self.seed, self.frames, self.fps, self.faults = seed, frames, fps, faults
-        self.camera = camera or Camera.from_field_of_view(size, 60.0, 1.4, pitch=0.03)
+        self.camera = Camera.from_field_of_view(size, 60.0, 1.4, pitch=0.03)
         self.duration = frames / fps
         rng = np.random.default_rng((seed, 0xD21FE))
         self._speed = float(rng.uniform(20, 25))
@@ -71,7 +67,7 @@ class SyntheticDrive:
         ]
         self._texture = int(rng.integers(1 << 28)) * 55 + 1  # no cracks, patches or bars across the road
         self._skyline = (float(rng.uniform(0.02, 0.06)), float(rng.uniform(0.02, 0.05)))
-        self._change_at = 0.45 * self.duration if lane_change else math.inf
+        self._change_at = 0.45 * self.duration
         self._actors = self._draw_actors(rng)
 
     def __len__(self) -> int:
@@ -152,13 +148,9 @@ class SyntheticDrive:
             actors.append(_Actor(model, s, relative, wave, float(rng.uniform(12, 18)), speed))
 
         # The one ahead: the ego vehicle closes in on it until it changes lanes, and passes it afterwards.
-        change = min(self._change_at, self.duration)
-        if math.isfinite(self._change_at):
-            add(0.0, 13.0 + 1.3 * change, -1.3, wave=1.5, heavy=0.0)
-            add(width, 38.0, 0.0, wave=9.0, heavy=0.0)
-        else:
-            add(0.0, 26.0, 0.0, wave=14.0, heavy=0.0)
-            add(width, 55.0, 0.15, wave=6.0)
+        change = self._change_at
+        add(0.0, 13.0 + 1.3 * change, -1.3, wave=1.5, heavy=0.0)
+        add(width, 38.0, 0.0, wave=9.0, heavy=0.0)
         for i in range(6):
             add(-width, 14.0 + 34 * i + float(rng.uniform(-8, 8)), -2.2, heavy=0.6)
         for i in range(2):
