@@ -250,12 +250,11 @@ def build_loader(
     shuffle: bool = True,
     weights: NDArray[np.float64] | None = None,
     samples_per_epoch: int | None = None,
-    drop_last: bool | None = None,
     workers: int = 0,
     pin_memory: bool = False,
     share: tuple[int, int] = (0, 1),
 ) -> Loader:
-    """Build a deterministic loader.
+    """Build a deterministic loader. When it shuffles it leaves out a last batch that is not full, if another is left.
 
     Args:
         dataset: A `DrivingDataset`, a `MixedDataset` (whose weights are used) or anything alike.
@@ -266,7 +265,6 @@ def build_loader(
         weights: (N,) relative sampling weights, for example of `sampling_weights`; those of a `MixedDataset` if left
             out.
         samples_per_epoch: Length of an epoch when shuffling; the number of samples if left out.
-        drop_last: Leave out a last batch that is not full; if left out, when shuffling and another batch is left.
         workers: Processes that read ahead; 0 reads in this one.
         pin_memory: Put batches into page-locked memory, for a GPU.
         share: (index, count): give the index-th of count equal parts of every batch, for one of several processes;
@@ -287,7 +285,7 @@ def build_loader(
     if weights is not None and (weights.shape != (len(dataset),) or not (weights >= 0).all() or not weights.any()):
         raise ConfigError(f"weights must be {len(dataset)} numbers, none negative and one above 0")
     length = samples_per_epoch or len(dataset)
-    drop_last = (shuffle and length >= batch_size) if drop_last is None else drop_last
+    drop_last = shuffle and length >= batch_size
     rest = length % batch_size
     if 0 < rest < share[1] and not drop_last:
         raise ConfigError(f"{rest} of {length} images are left for a last batch, too few for {share[1]} processes")
