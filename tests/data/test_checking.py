@@ -299,7 +299,7 @@ def test_copies_are_found_among_many_pictures_of_one_hash() -> None:
     same = bytes(range(256))
     facts = {"train": [fact(number) for number in range(2000)]}
     facts["val"] = [dataclasses.replace(facts["train"][1], digest=b"other"), *(fact(2000 + i) for i in range(300))]
-    collector = checking._Collector(5)
+    collector = checking._Collector()
     checking._find_near_duplicates(facts, collector)
     (finding,) = collector.findings()
     assert (finding.count, finding.examples) == (1, ("val/1 ~ train/1",))

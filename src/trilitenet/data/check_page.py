@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import DEFAULT_ANCHORS, Anchors
+from trilitenet.config import DEFAULT_ANCHORS
 from trilitenet.data.checking import KINDS, CheckReport
 
 __all__ = ["check_page", "picture_page"]
@@ -31,13 +31,12 @@ svg text { font: 11px system-ui, sans-serif; fill: currentColor; }
 _SERIES: Final = ("var(--bar)", "var(--two)", "#009e73", "#cc79a7")
 
 
-def check_page(report: CheckReport, sheet: NDArray[np.uint8] | None = None, anchors: Anchors = DEFAULT_ANCHORS) -> str:
+def check_page(report: CheckReport, sheet: NDArray[np.uint8] | None = None) -> str:
     """Return the page.
 
     Args:
         report: What was found.
         sheet: (H, W, 3) uint8 RGB contact sheet.
-        anchors: To draw among the box sizes.
     """
     splits = list(report.images)
     state = '<span class="good">nothing wrong</span>'
@@ -64,7 +63,7 @@ def check_page(report: CheckReport, sheet: NDArray[np.uint8] | None = None, anch
         "<h2>Boxes</h2>",
         _table(["category", *splits], _by_row({split: report.objects[split] for split in splits})),
         '<div class="plots">',
-        _figure(_box_plot(report.box_sizes, anchors), _box_caption(report)),
+        _figure(_box_plot(report.box_sizes), _box_caption(report)),
         _figure(_bars({"images": dict(list(report.sizes.items())[:16])}), "Image sizes"),
         "</div><h2>Conditions</h2><div class='plots'>",
         *(
@@ -171,7 +170,7 @@ def _bars(series: Mapping[str, Mapping[str, int]]) -> str:
     return f'<svg width="{left + width + 60}" height="{y + 4}">{"".join(parts)}</svg>'
 
 
-def _box_plot(sizes: Sequence[tuple[float, float]], anchors: Anchors) -> str:
+def _box_plot(sizes: Sequence[tuple[float, float]]) -> str:
     """Return box sizes and anchors on logarithmic axes from 1 to 640 pixels."""
     side, margin = 320, 36
 
@@ -185,7 +184,7 @@ def _box_plot(sizes: Sequence[tuple[float, float]], anchors: Anchors) -> str:
     for width, height in sizes:
         x, y = margin + place(width), side + 4 - place(height)
         parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1.6" fill="var(--bar)" fill-opacity=".35"/>')
-    for level in anchors:
+    for level in DEFAULT_ANCHORS:
         for width, height in level:
             x, y = margin + place(width), side + 4 - place(height)
             parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="none" stroke="var(--two)" stroke-width="2"/>')

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from trilitenet.config import DEFAULT_ANCHORS, LONG_SIDE, Anchors, parse_json
+from trilitenet.config import DEFAULT_ANCHORS, LONG_SIDE, parse_json
 from trilitenet.data.description import DatasetDescription, MaskMeaning, class_table, read_description
 from trilitenet.data.prepared import is_prepared
 from trilitenet.data.reading import (
@@ -84,6 +84,8 @@ _THUMB_DISTANCE: Final = 5.0
 _SLACK: Final = 1.0
 """A box may reach out of the image by this many pixels: annotators round."""
 _MIN_ANCHOR_RECALL: Final = 0.98
+_EXAMPLES: Final = 5
+"""Named for each kind of fault."""
 _MIN_BOXES: Final = 50
 """Anchors are judged by no fewer boxes."""
 
@@ -218,18 +220,14 @@ def check_dataset(
     root: str | Path,
     *,
     workers: int = 0,
-    anchors: Anchors = DEFAULT_ANCHORS,
     progress: Callable[[int, int], None] | None = None,
-    examples: int = 5,
 ) -> CheckReport:
     """Look for faults in a data set in the published layout, and count what is in it.
 
     Args:
         root: The data set.
         workers: Processes; 0 works in this one.
-        anchors: That boxes should fit, (width, height) in pixels at a long side of 640.
         progress: Called with (images done, images in all).
-        examples: Named for each kind of fault.
 
     Raises:
         DataError: If it has another layout, or a broken ``dataset.yaml``.
@@ -260,7 +258,7 @@ def check_dataset(
         facts[split].append(fact)
         if progress:
             progress(done, len(work))
-    collector = _Collector(examples)
+    collector = _Collector()
     for split, items in facts.items():
         for fact in items:
             for kind, where in fact.faults:
@@ -285,7 +283,7 @@ def check_dataset(
     box_sizes = np.concatenate(
         [np.zeros((0, 2), np.float32), *(f.box_sizes for items in facts.values() for f in items)]
     )
-    recall = _anchor_recall(box_sizes, anchors)
+    recall = _anchor_recall(box_sizes)
     if len(box_sizes) >= _MIN_BOXES and recall < _MIN_ANCHOR_RECALL:
         collector.add("anchors", "", f"anchors fit {recall:.1%} of {len(box_sizes)} boxes; train with auto-anchor")
     chosen = np.random.default_rng(0).permutation(len(box_sizes))[:2000]
@@ -317,14 +315,13 @@ def _is_mask(path: Path) -> bool:
 class _Collector:
     """Counts faults and keeps the first examples of each kind and split."""
 
-    def __init__(self, examples: int) -> None:
-        self._limit = examples
+    def __init__(self) -> None:
         self._counts: Counter[tuple[str, str]] = Counter()
         self._examples: dict[tuple[str, str], list[str]] = defaultdict(list)
 
     def add(self, kind: str, split: str, example: str) -> None:
         self._counts[kind, split] += 1
-        if len(self._examples[kind, split]) < self._limit:
+        if len(self._examples[kind, split]) < _EXAMPLES:
             self._examples[kind, split].append(example)
 
     def findings(self) -> tuple[Finding, ...]:
@@ -591,12 +588,12 @@ def _conditions(facts: dict[str, list[_Facts]], index: list[dict[str, str]]) -> 
     }
 
 
-def _anchor_recall(sizes: NDArray[np.float32], anchors: Anchors, ratio: float = 4.0) -> float:
-    """Return the part of the boxes whose sides differ from some anchor's by less than ``ratio``."""
+def _anchor_recall(sizes: NDArray[np.float32]) -> float:
+    """Return the part of the boxes whose sides differ from some default anchor's by a factor of less than 4."""
     if not len(sizes):
         return float("nan")
-    every = np.array([anchor for level in anchors for anchor in level], np.float32)
-    return float((best_side_ratio(sizes, every) > 1 / ratio).mean())
+    anchors = np.array(DEFAULT_ANCHORS, np.float32).reshape(-1, 2)
+    return float((best_side_ratio(sizes, anchors) > 1 / 4).mean())
 
 
 def _means(facts: dict[str, list[_Facts]], task: str) -> dict[str, float]:
