@@ -108,17 +108,17 @@ def _inside(cells: Tensor, grid: tuple[int, int]) -> Tensor:
     return torch.stack([cells[..., 0].clamp(0, columns - 1), cells[..., 1].clamp(0, rows - 1)], dim=-1)
 
 
-def complete_iou(first: Tensor, second: Tensor, eps: float = 1e-7) -> Tensor:
+def complete_iou(first: Tensor, second: Tensor) -> Tensor:
     """Return the complete IoU of pairs of boxes (Zheng et al., 2020): IoU - centre distance - aspect ratio term.
 
     Args:
         first: (N, 4) centre x, centre y, width, height in any one unit.
         second: (N, 4) likewise.
-        eps: Added to denominators.
 
     Returns:
         (N,) values in (-2, 1]; the weight of the aspect ratio term carries no gradient.
     """
+    eps = 1e-7  # of denominators
     centre1, size1 = first[:, :2], first[:, 2:]
     centre2, size2 = second[:, :2], second[:, 2:]
     low1, high1 = centre1 - size1 / 2, centre1 + size1 / 2
@@ -164,6 +164,8 @@ def ignored_cells(ignored: Tensor, images: int, grid: tuple[int, int], stride: i
     return hits.index_add_(0, ignored[:, 0].long(), inside) > 0
 
 
+_BALANCE: Final = (4.0, 1.0, 0.4)
+"""Weight of the objectness of 1/8, 1/16 and 1/32."""
 _SINGLE_CLASS_SHARE: Final = 1 / 80
 """Of the class term's gain where there is one class (YOLOv5 scales the gain by classes / 80)."""
 
@@ -181,13 +183,11 @@ class DetectionLoss(nn.Module):
         anchors: (3, 3, 2) width, height in input pixels, a level a row.
         classes: Number of classes.
         gains: Of the box, objectness and class terms.
-        balance: Of the objectness of 1/8, 1/16 and 1/32.
         ratio_limit: See `match`.
         single_class_loss: Train the class score also when there is one class (the published code does not, which
             leaves it as it was initialised). All its targets are 1, which says nothing of the image, so the term has
             1/80 of its weight then: at full weight it takes from the objectness (docs/training.md).
         label_smoothing: Class targets are 1 - s/2 and s/2, s in [0, 1).
-        strides: Input pixels a cell, a level.
     """
 
     anchors: Tensor
@@ -198,15 +198,13 @@ class DetectionLoss(nn.Module):
         classes: int,
         *,
         gains: tuple[float, float, float] = (0.05, 1.0, 0.5),
-        balance: tuple[float, float, float] = (4.0, 1.0, 0.4),
         ratio_limit: float = 4.0,
         single_class_loss: bool = True,
         label_smoothing: float = 0.0,
-        strides: Sequence[int] = STRIDES,
     ) -> None:
         super().__init__()
-        if anchors.ndim != 3 or anchors.shape[0] != len(strides) or anchors.shape[2] != 2:
-            raise ShapeError(f"anchors must be ({len(strides)}, A, 2), got {tuple(anchors.shape)}")
+        if anchors.ndim != 3 or anchors.shape[0] != len(STRIDES) or anchors.shape[2] != 2:
+            raise ShapeError(f"anchors must be ({len(STRIDES)}, A, 2), got {tuple(anchors.shape)}")
         if not 0.0 <= label_smoothing < 1.0:
             raise ConfigError(f"label_smoothing must be in [0, 1), got {label_smoothing}")
         if ratio_limit <= 1.0:
@@ -214,11 +212,9 @@ class DetectionLoss(nn.Module):
         self.register_buffer("anchors", anchors.detach().clone(), persistent=False)
         self.classes = classes
         self.gains = gains
-        self.balance = balance
         self.ratio_limit = ratio_limit
         self.single_class_loss = single_class_loss
         self.label_smoothing = label_smoothing
-        self.strides = tuple(strides)
 
     def forward(self, outputs: Sequence[Tensor], boxes: Tensor, ignored: Tensor, labelled: Tensor) -> DetectionTerms:
         """Compute the terms.
@@ -247,7 +243,7 @@ class DetectionLoss(nn.Module):
         self, index: int, output: Tensor, boxes: Tensor, ignored: Tensor, labelled: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         images, anchors, rows, columns, _ = output.shape
-        stride = self.strides[index]
+        stride = STRIDES[index]
         sizes = self.anchors[index].to(output.dtype) / stride
         boxes = boxes.to(output.dtype)
         scaled = torch.cat([boxes[:, :2], boxes[:, 2:] / stride], dim=1)
@@ -271,7 +267,7 @@ class DetectionLoss(nn.Module):
             skipped = ignored_cells(ignored, images, (rows, columns), stride)
             counts = ((matched | ~skipped[:, None]) & labelled[:, None, None, None]).to(output.dtype)
         entropy = F.binary_cross_entropy_with_logits(output[..., 4], target, reduction="none")
-        objectness = self.balance[index] * (entropy * counts).sum() / counts.sum().clamp(min=1)
+        objectness = _BALANCE[index] * (entropy * counts).sum() / counts.sum().clamp(min=1)
 
         if self.classes == 1 and not self.single_class_loss:
             return box, objectness, torch.zeros_like(box)
