@@ -317,10 +317,8 @@ def _parse(text: bytes, path: Path) -> Any:
 def _tasks_of(path: Path) -> frozenset[Task]:
     """Return the task that a file of a whole split is about, by its name; empty = its name does not tell."""
     match = re.fullmatch(r"(det|drivable|lane)_(train|val|test)\.json", path.name)
-    if match is None:
-        return frozenset()
     names: dict[str, Task] = {"det": "detection", "drivable": "drivable", "lane": "lane"}
-    return frozenset({names[match[1]]})
+    return frozenset({names[match[1]]}) if match else frozenset()
 
 
 def _tasks_in(entry: Any) -> set[Task]:
@@ -388,7 +386,7 @@ def _index(path: Path) -> Iterator[tuple[str, _Part, dict[str, Any]]]:
         while True:
             while position < len(text) and text[position] in " \t\r\n,":
                 position += 1
-            if position >= len(text) or len(text) - position < 2:
+            if len(text) - position < 2:
                 more = file.read(_CHUNK).decode("latin-1")
                 if not more and (position >= len(text) or text[position] != "]"):
                     raise DataError(f"{path}: ends in the middle of its list; download it again")
@@ -446,7 +444,7 @@ def _images(folders: dict[str, Path], split: str) -> dict[str, Path]:
     Raises:
         DataError: If two images have one name.
     """
-    for pattern in (rf"images/100k/{split}", rf"100k/{split}", rf"images/{split}", rf"{split}"):
+    for pattern in (f"images/100k/{split}", f"100k/{split}", f"images/{split}", split):
         images: dict[str, Path] = {}
         for where, folder in folders.items():
             if re.search(rf"(^|/){pattern}$", where) and "label" not in where:
@@ -490,9 +488,8 @@ def _drivable_masks(
 
 def _lane_values(*, crosswalk: bool, vertical: bool) -> dict[int | tuple[int, int, int], str]:
     """Return the values of a 2020 lane mask that count as marking."""
-    values: dict[int | tuple[int, int, int], str] = {}
-    for value in range(64):
-        if value & 8 or (value & 32 and not vertical) or (not value & 7 and not crosswalk):
-            continue
-        values[value] = "foreground"
-    return values
+    return {
+        value: "foreground"
+        for value in range(64)
+        if not value & 8 and (vertical or not value & 32) and (crosswalk or value & 7)
+    }
