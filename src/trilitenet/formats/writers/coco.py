@@ -22,10 +22,6 @@ class CocoWriter(Writer):
     The classes have the category ids 1, 2, ...; after them come ``drivable`` and ``lane``, whose annotations are one
     run-length mask an image. A task that no perception has, has no categories: it was not looked for. The list of
     images is held until the end: about 300 bytes a frame.
-
-    Args:
-        output: The folder.
-        overwrite: Replace files that exist.
     """
 
     FILES = ("coco.json",)

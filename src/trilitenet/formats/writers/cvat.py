@@ -35,8 +35,6 @@ class CvatWriter(Writer):
     and 300 bytes a box without a track.
 
     Args:
-        output: The folder.
-        overwrite: Replace files that exist.
         tolerance: A polygon leaves the mask's outline by at most so many pixels.
     """
 

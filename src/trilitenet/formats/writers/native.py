@@ -32,12 +32,7 @@ def to_document(perception: Perception, road: Mapping[str, Any] | None = None) -
 
 
 class JsonWriter(Writer):
-    """Writes ``NAME.json`` for each picture, and for each video one with all of its frames.
-
-    Args:
-        output: The folder.
-        overwrite: Replace files that exist.
-    """
+    """Writes ``NAME.json`` for each picture, and for each video one with all of its frames."""
 
     PICTURE_FILES = VIDEO_FILES = ("{}.json",)
 
@@ -70,12 +65,7 @@ class JsonWriter(Writer):
 
 
 class JsonLinesWriter(Writer):
-    """Writes ``perceptions.jsonl``: a line an image or frame, readable while it grows.
-
-    Args:
-        output: The folder.
-        overwrite: Replace files that exist.
-    """
+    """Writes ``perceptions.jsonl``: a line an image or frame, readable while it grows."""
 
     FILES = ("perceptions.jsonl",)
 

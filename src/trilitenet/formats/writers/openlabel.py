@@ -30,10 +30,6 @@ class OpenLabelWriter(Writer):
     """Writes ``NAME.openlabel.json`` for each picture and each video.
 
     The list of objects is held until a video ends: about 400 bytes an object, of which each box without a track is one.
-
-    Args:
-        output: The folder.
-        overwrite: Replace files that exist.
     """
 
     PICTURE_FILES = VIDEO_FILES = ("{}.openlabel.json",)

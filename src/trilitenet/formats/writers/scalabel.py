@@ -17,12 +17,7 @@ __all__ = ["ScalabelWriter"]
 
 
 class ScalabelWriter(Writer):
-    """Writes ``scalabel.json``: boxes, drivable area and lane markings as masks, lines of lanes as polylines.
-
-    Args:
-        output: The folder.
-        overwrite: Replace files that exist.
-    """
+    """Writes ``scalabel.json``: boxes, drivable area and lane markings as masks, lines of lanes as polylines."""
 
     FILES = ("scalabel.json",)
 

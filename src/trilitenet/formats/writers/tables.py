@@ -94,12 +94,7 @@ def box_rows(perception: Perception) -> list[dict[str, Any]]:
 
 
 class CsvWriter(Writer):
-    """Writes ``frames.csv``, a row a frame, and ``boxes.csv``, a row an object; both are readable while they grow.
-
-    Args:
-        output: The folder.
-        overwrite: Replace files that exist.
-    """
+    """Writes ``frames.csv``, a row a frame, and ``boxes.csv``, a row an object; both are readable while they grow."""
 
     FILES = ("frames.csv", "boxes.csv")
 
@@ -136,10 +131,6 @@ def _lines(columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> str:
 
 class ParquetWriter(Writer):
     """Writes ``perceptions.parquet``: a row a frame, with a list of boxes, the masks as run-length text and the road.
-
-    Args:
-        output: The folder.
-        overwrite: Replace files that exist.
 
     Raises:
         MissingExtraError: If pyarrow is not installed.
