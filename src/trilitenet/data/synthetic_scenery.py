@@ -106,10 +106,9 @@ def draw_item(world: World, item: Item, image: NDArray[np.uint8], ids: NDArray[n
             u, v = pixels[1:3].mean(axis=0)
             lamps.append(Lamp(float(u), float(v), max(0.6, scale * 0.15), (255.0, 214.0, 150.0), 0.8, SCENERY))
     elif item.kind == "post":
-        box = np.array([[x, y - 0.06, 0], [x, y + 0.06, 0], [x, y + 0.06, item.height], [x, y - 0.06, item.height]])
-        fill(image, ids, camera.to_pixels(box), light.tone((225.0, 225.0, 222.0), x, y))
-        box[:, 2] = (item.height * 0.7, item.height * 0.7, item.height * 0.85, item.height * 0.85)
-        fill(image, ids, camera.to_pixels(box), light.tone((40.0, 40.0, 42.0), x, y))
+        tall = item.height
+        for low, high, grey in ((0.0, tall, (225.0, 225.0, 222.0)), (tall * 0.7, tall * 0.85, (40.0, 40.0, 42.0))):
+            fill(image, ids, camera.to_pixels(_upright(x, y, 0.06, low, high)), light.tone(grey, x, y))
     elif item.kind == "sign":
         _draw_sign(camera, item, x, y, image, ids, light)
     elif item.kind == "gantry":
@@ -117,8 +116,7 @@ def draw_item(world: World, item: Item, image: NDArray[np.uint8], ids: NDArray[n
         grey = light.tone((120.0, 122.0, 125.0), x, y)
         for edge in (right - 0.8, left + 0.8):
             px, py, _ = world.course.at(item.s, edge)
-            pole = np.array([[px, py - 0.2, 0], [px, py + 0.2, 0], [px, py + 0.2, 6.6], [px, py - 0.2, 6.6]])
-            fill(image, ids, camera.to_pixels(pole), grey)
+            fill(image, ids, camera.to_pixels(_upright(px, py, 0.2, 0.0, 6.6)), grey)
         beam = np.array(
             [
                 (*world.course.at(item.s, e)[:2], z)
@@ -137,14 +135,14 @@ def draw_item(world: World, item: Item, image: NDArray[np.uint8], ids: NDArray[n
             tint: Colour = (18.0 * shine, 62.0 * shine, 140.0 * shine)
             if item.style % 2 == 0:
                 tint = (12.0 * shine, 96.0 * shine, 62.0 * shine)
-            fill(
-                image,
-                ids,
-                camera.to_pixels(board),
-                light.lamp_tone(tint, x),
-            )
+            fill(image, ids, camera.to_pixels(board), light.lamp_tone(tint, x))
     elif item.kind == "pedestrian":
         _draw_person(world, item, x, y, image, ids)
+
+
+def _upright(x: float, y: float, half: float, low: float, high: float) -> NDArray[np.float64]:
+    """Return (4, 3) corners of a rectangle across the road, ``half`` metres to either side of y."""
+    return np.array([[x, y - half, low], [x, y + half, low], [x, y + half, high], [x, y - half, high]])
 
 
 def _draw_person(
@@ -169,13 +167,12 @@ def _draw_sign(
     ids: NDArray[np.uint8],
     light: Light,
 ) -> None:
-    pole = np.array([[x, y - 0.04, 0], [x, y + 0.04, 0], [x, y + 0.04, item.height], [x, y - 0.04, item.height]])
+    pole = _upright(x, y, 0.04, 0.0, item.height)
     fill(image, ids, camera.to_pixels(pole), light.tone((130.0, 132.0, 134.0), x, y))
     half, centre = item.width / 2, item.height
     style = item.style % 4
     if item.width > 1.2:
-        board = np.array([[x, y - half, centre - half * 0.6], [x, y + half, centre - half * 0.6],
-                          [x, y + half, centre + half * 0.6], [x, y - half, centre + half * 0.6]])  # fmt: skip
+        board = _upright(x, y, half, centre - half * 0.6, centre + half * 0.6)
         tint: Colour = ((22, 66, 146), (14, 98, 62), (228, 228, 226), (225, 178, 40))[style]
         fill(image, ids, camera.to_pixels(board), light.tone(tint, x, y))
         return
