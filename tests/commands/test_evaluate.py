@@ -234,6 +234,17 @@ def test_evaluating_an_artefact_needs_no_torch(artefacts: Artefacts, data: Path)
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize("limit", [None, 2])
+def test_predictions_of_other_images_are_refused_at_once(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int | None
+) -> None:
+    entry = {"image_id": "a.jpg", "category_id": 1, "bbox": [0, 0, 2, 2], "score": 0.5}
+    (tmp_path / "detections.json").write_text(json.dumps([entry]))
+    monkeypatch.setattr(DrivingDataset, "__getitem__", None)
+    with pytest.raises(DataError, match=r"for none of the 4 images \(such as 'a\.jpg'\); image_id must be the name"):
+        score(tmp_path, data=data, limit=limit)
+
+
 def test_data_of_other_classes_are_told(
     artefacts: Artefacts, data: Path, weights: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

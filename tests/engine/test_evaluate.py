@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import time
 import tracemalloc
 from collections.abc import Iterator
@@ -143,14 +142,6 @@ def test_saved_predictions_score_as_the_predictor_did(tmp_path: Path) -> None:
     assert saved.provenance.runtime == "saved predictions"
     both = score_predictions(SavedPredictions(tmp_path, ("vehicle",)), images, protocol="both", resamples=0)
     assert values(both)["paper/drivable/miou"] > 0.8
-
-
-def test_predictions_of_other_images_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "detections.json").write_text(
-        json.dumps([{"image_id": "x", "category_id": 1, "bbox": [0, 0, 2, 2], "score": 0.5}])
-    )
-    with pytest.raises(DataError, match="for none of the 12 images"):
-        score_predictions(SavedPredictions(tmp_path, ("vehicle",)), Images())
 
 
 def test_the_best_thresholds_are_found_in_one_pass() -> None:

@@ -15,7 +15,7 @@ from trilitenet.engine.predictions import DETECTIONS_FILE, SavedPredictions
 from trilitenet.engine.provenance import hash_files
 from trilitenet.engine.report import Report
 from trilitenet.engine.scorecard import CONDITIONS
-from trilitenet.errors import ConfigError
+from trilitenet.errors import ConfigError, DataError
 
 __all__ = ["score"]
 
@@ -60,6 +60,7 @@ def score(
 
     Raises:
         ConfigError: If a count is negative, or the confidence out of range.
+        DataError: If predictions are for none of the images, or one is broken.
         OutputError: If there is a report already.
     """
     check_counts(resamples, worst, limit, paper_batch)
@@ -68,6 +69,11 @@ def score(
     check_output(output, overwrite)
     dataset = DrivingDataset(data, split, class_names=tuple(classes))
     saved = SavedPredictions(predictions, classes)
+    if saved.names and saved.names.isdisjoint(dataset.names):
+        raise DataError(
+            f"{predictions}: predictions for none of the {len(dataset)} images "
+            f"(such as {min(saved.names)!r}); image_id must be the name of the image without ending"
+        )
     if "detection" in saved.tasks:
         dataset.warn_of_foreign()
     with show_progress("images") as shown:

@@ -214,7 +214,7 @@ def score_predictions(
 
     Raises:
         ConfigError: If there is no such protocol.
-        DataError: If there are no images, predictions are for none of them, or one is broken.
+        DataError: If there are no images, or a prediction is broken.
     """
     scorecard = Scorecard(
         dataset.class_names,
@@ -228,10 +228,8 @@ def score_predictions(
     started = time.time()
     count = _count(dataset, limit)
     canvases: dict[tuple[int, int], None] = {}
-    known = 0
     scored = _ahead(lambda index: _with_saved(dataset[index], predictions), range(count), 4, "reader")
     for done, (sample, perception) in enumerate(scored, start=1):
-        known += sample.name in predictions.names
         letterbox = Letterbox.fit(perception.size)
         canvases[letterbox.canvas] = None
         scorecard.add(
@@ -241,11 +239,6 @@ def score_predictions(
         )
         if progress is not None:
             progress(done, count)
-    if predictions.names and not known and count == len(dataset):
-        raise DataError(
-            f"{predictions.folder}: predictions for none of the {count} images "
-            f"(such as {min(predictions.names)!r}); image_id must be the name of the image without ending"
-        )
     details = {
         "model": str(predictions.folder),
         "runtime": SAVED,
