@@ -140,6 +140,9 @@ def test_coco_as_downloaded(tmp_path: Path) -> None:
     assert source.splits == ("train", "val")
     assert len(source.record("val", "one").objects or ()) == 5
     assert source.found[-1].startswith("not used: captions_train2017.json, captions_val2017.json, person_keypoints_")
+    for number in range(20):  # results of each picture, say
+        (tmp_path / f"{number:02}.json").write_text("{}")
+    assert read_coco(tmp_path).found[-1].endswith("08.json, 09.json and 14 more")
 
 
 @pytest.mark.parametrize("place", ["val2017", "images/val", "images", "annotations/images", "."])

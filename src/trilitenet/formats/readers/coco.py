@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,8 @@ from trilitenet.errors import DataError, brief
 from trilitenet.formats.readers.mapping import SPLIT_NAMES, LabelMapping, Labels, find_image, read_json
 
 __all__ = ["read_coco"]
+
+_MOST_NAMED: Final = 10
 
 
 def read_coco(root: str | Path, mapping: LabelMapping | None = None) -> ListedRecords:
@@ -61,7 +63,8 @@ def read_coco(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
         raise DataError(f"{root}: none of the images of its annotation files is there")
     mapping.check_categories(categories, root)
     if unused:
-        found.append(f"not used: {', '.join(path.name for path in unused)}")
+        more = f" and {len(unused) - _MOST_NAMED} more" * (len(unused) > _MOST_NAMED)
+        found.append(f"not used: {', '.join(path.name for path in unused[:_MOST_NAMED])}{more}")
     splits = {split: named_apart(items) for split, items in records.items() if items}
     return ListedRecords(splits, tuple(found), mapping.origin("coco", root))
 
