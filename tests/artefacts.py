@@ -1,4 +1,4 @@
-"""Exported artefacts for tests, made once a session."""
+"""Exported artefacts for tests, made once for all processes of a session."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from filelock import FileLock
 from numpy.typing import NDArray
 
 from trilitenet.config import ArtefactInfo, Thresholds
@@ -28,7 +29,18 @@ class Artefacts:
     images: NDArray[np.uint8]
 
 
-def make_artefacts(folder: Path) -> Artefacts:
+def shared_artefacts(folder: Path) -> Artefacts:
+    """Return what is in a folder, which the first process to come makes."""
+    with FileLock(folder.with_suffix(".lock")):
+        if not folder.exists():
+            part = folder.with_suffix(".part")
+            part.mkdir(exist_ok=True)
+            _make_artefacts(part)
+            part.rename(folder)
+    return Artefacts(folder, np.random.default_rng(0).integers(0, 256, (2, *SIZE, 3), np.uint8))
+
+
+def _make_artefacts(folder: Path) -> None:
     pytest.importorskip("onnxscript")
     pytest.importorskip("openvino")
     from tests.deploy.networks import lively_network
@@ -53,4 +65,3 @@ def make_artefacts(folder: Path) -> Artefacts:
         info = ArtefactInfo("ncnn", size=SIZE, input="float_nchw", masks="logit", trilitenet="0")
         graph = DeployGraph(network, LAYOUTS["planar"], masks="logit")
         save_ncnn(build_ncnn(graph, card, info), folder / "model.ncnn.param", card, info)
-    return Artefacts(folder, np.random.default_rng(0).integers(0, 256, (2, *SIZE, 3), np.uint8))

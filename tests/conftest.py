@@ -46,9 +46,12 @@ def driving() -> Path:
 @pytest.fixture(scope="session")
 def artefacts(tmp_path_factory: pytest.TempPathFactory) -> Artefacts:
     """Exported files of a small network; skips where the runtimes are absent."""
-    from tests.artefacts import make_artefacts
+    from tests.artefacts import shared_artefacts
 
-    return make_artefacts(tmp_path_factory.mktemp("artefacts"))
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent  # which the processes share
+    return shared_artefacts(folder / "artefacts")
 
 
 @pytest.fixture(scope="session", autouse=True)
