@@ -17,8 +17,8 @@ PYTEST_ARGS ?=
 DEMO ?= demo-output
 
 INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile
-# On all cores, where pip compiles on one; some packages hold files for other versions of Python.
-COMPILE := $(BIN)/python -m compileall -q -j 0 $(VENV)/lib > /dev/null 2>&1 || true
+# On all cores, where pip compiles on one; some packages hold files for other versions of Python. Their tests stay.
+COMPILE := $(BIN)/python -m compileall -q -j 0 -x 'site-packages/.*/tests?/' $(VENV)/lib > /dev/null 2>&1 || true
 PYTORCH := $(VENV)/.installed-pytorch
 RUNTIME := $(VENV)/.installed-runtime
 DEVELOP := $(VENV)/.installed-develop
