@@ -12,6 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,8 @@ from trilitenet.engine.ema import MovingAverage
 from trilitenet.engine.loggers import CsvLogger, read_csv
 from trilitenet.engine.predictions import PredictionWriter
 from trilitenet.engine.recipe import read_recipe
-from trilitenet.engine.train import Trainer
+from trilitenet.engine.results import write_results
+from trilitenet.engine.train import Trainer, TrainResult
 from trilitenet.errors import ConfigError, DataError, MissingExtraError, OutputError, TrainingError, WeightsError
 from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.models.encoder import Encoder
@@ -59,6 +61,37 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _no_page() -> Iterator[None]:
+    """Draw no page of results, which takes longer than two steps: one test looks at it, and draws it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("trilitenet.commands.train.write_results", lambda *_, **__: None)
+        yield
+
+
+VALIDATED: dict[str, Any] = {"val_split": "val", "max_steps": 4, "pictures": 0}
+"""Two epochs of two steps, each measured."""
+
+
+@pytest.fixture(scope="module")
+def straight(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainResult:
+    """Return what a run comes to that is measured after both epochs, and that nothing stops."""
+    return train(**logged(scenes, tmp_path_factory.mktemp("straight"), **VALIDATED))
+
+
+@pytest.fixture(scope="module")
+def _one_step(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("one")
+    train(**settings(scenes, folder, max_steps=1))
+    return folder
+
+
+@pytest.fixture
+def begun(_one_step: Path, tmp_path: Path) -> Path:
+    """Return the folder of a run of one step."""
+    return shutil.copytree(_one_step, tmp_path / "begun")
+
+
 def settings(scenes: Path, output: Path, **more: Any) -> dict[str, Any]:
     return {
         "data": str(scenes),
@@ -71,7 +104,7 @@ def settings(scenes: Path, output: Path, **more: Any) -> dict[str, Any]:
         "val_split": "",
         "device": "cpu",
         "precision": "32-true",
-        "loggers": (),  # with csv, a page of results is drawn, too
+        "loggers": (),
         "log_every": 1,
         "auto_anchor": False,
         **more,
@@ -112,21 +145,18 @@ def curves(folder: Path) -> list[tuple[int, str, float]]:
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")  # two workers on a machine of one core
 def test_resume_is_bit_for_bit(scenes: Path, tmp_path: Path) -> None:
     options = {"workers": 2, "multi_scale": (0.8, 1.6), "precision": "auto", "balancing": "uncertainty"}
-    train(**logged(scenes, tmp_path / "straight", max_steps=20, **options))
-    for steps in (9, 20):  # two steps an epoch: step 9 is in the middle of one
-        result = train(resume=steps > 9, **logged(scenes, tmp_path / "parts", max_steps=steps, **options))
+    train(**logged(scenes, tmp_path / "straight", max_steps=10, **options))
+    for steps in (5, 10):  # two steps an epoch: step 5 is in the middle of one
+        result = train(resume=steps > 5, **logged(scenes, tmp_path / "parts", max_steps=steps, **options))
         assert result.steps == steps
     same(state(tmp_path / "straight"), state(tmp_path / "parts"))
     assert curves(tmp_path / "straight") == curves(tmp_path / "parts")
 
 
-@pytest.mark.slow
-def test_resume_is_bit_for_bit_with_validation_between(scenes: Path, tmp_path: Path) -> None:
-    options = {"val_split": "val", "pictures": 0}
-    for steps in (3, 6):
-        train(resume=steps > 3, **settings(scenes, tmp_path / "parts", max_steps=steps, **options))
-    train(**settings(scenes, tmp_path / "straight", max_steps=6, **options))
-    same(state(tmp_path / "straight"), state(tmp_path / "parts"))
+def test_resume_is_bit_for_bit_with_validation_between(scenes: Path, tmp_path: Path, straight: TrainResult) -> None:
+    for steps in (3, 4):
+        train(resume=steps > 3, **settings(scenes, tmp_path, **VALIDATED | {"max_steps": steps}))
+    same(state(straight.folder), state(tmp_path))
 
 
 def test_initial_weights_keep_their_anchors(scenes: Path, tmp_path: Path) -> None:
@@ -139,10 +169,9 @@ def test_an_epoch_without_a_step_is_refused(scenes: Path, tmp_path: Path) -> Non
         train(**settings(scenes, tmp_path, samples_per_epoch=1, accumulate=4))
 
 
-def test_resuming_takes_the_new_weight_decay(scenes: Path, tmp_path: Path) -> None:
-    train(**settings(scenes, tmp_path, max_steps=1))
-    train(resume=True, **settings(scenes, tmp_path, max_steps=2, weight_decay=0.3, betas=(0.5, 0.6)))
-    groups = read_checkpoint(tmp_path / "last.ckpt")["optimiser"]["param_groups"]
+def test_resuming_takes_the_new_weight_decay(scenes: Path, begun: Path) -> None:
+    train(resume=True, **settings(scenes, begun, max_steps=2, weight_decay=0.3, betas=(0.5, 0.6)))
+    groups = read_checkpoint(begun / "last.ckpt")["optimiser"]["param_groups"]
     assert max(group["weight_decay"] for group in groups) == 0.3
     assert {tuple(group["betas"]) for group in groups} == {(0.5, 0.6)}
 
@@ -162,14 +191,13 @@ def test_what_has_no_effect_is_told(scenes: Path, tmp_path: Path, caplog: pytest
 
 
 def test_a_run_that_cannot_start_leaves_the_earlier_one(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scenes: Path, begun: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    train(**settings(scenes, tmp_path, max_steps=1))
-    before = sorted(path.name for path in tmp_path.iterdir())
+    before = sorted(path.name for path in begun.iterdir())
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(MissingExtraError, match="wandb"):
-        train(**settings(scenes, tmp_path, loggers=("csv", "wandb")), overwrite=True)
-    assert sorted(path.name for path in tmp_path.iterdir()) == before
+        train(**settings(scenes, begun, loggers=("csv", "wandb")), overwrite=True)
+    assert sorted(path.name for path in begun.iterdir()) == before
 
 
 def test_going_on_with_other_frozen_parts_is_refused(scenes: Path, tmp_path: Path) -> None:
@@ -269,14 +297,14 @@ def test_a_signal_saves_and_ends_cleanly(
             subprocess.run(["kill", f"-{number.value}", *processes], check=True)  # as a terminal or scheduler does
 
     monkeypatch.setattr(CsvLogger, "log", log)
-    result = train(**logged(scenes, tmp_path, max_steps=6, workers=workers))
+    result = train(**logged(scenes, tmp_path, max_steps=4, workers=workers))
     assert (result.finished, result.steps, result.exit_code) == (False, 3, 130)
     assert "--resume" in result.summary()
     assert state(tmp_path)["step"] == 3
     assert not result.weights.exists()
     assert signal.getsignal(number) == before
     monkeypatch.setattr(CsvLogger, "log", plain)
-    assert train(resume=True, **logged(scenes, tmp_path, max_steps=6, workers=workers)).finished
+    assert train(resume=True, **logged(scenes, tmp_path, max_steps=4, workers=workers)).finished
 
 
 def test_every_checkpoint_is_written_once_and_a_log_that_cannot_be_is_told(
@@ -299,7 +327,7 @@ def test_every_checkpoint_is_written_once_and_a_log_that_cannot_be_is_told(
 
 @pytest.mark.parametrize("last", [2, 4])
 def test_a_stop_in_the_last_step_of_an_epoch_loses_no_validation(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, last: int
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, straight: TrainResult, last: int
 ) -> None:
     plain, stops = CsvLogger.log, [last]
 
@@ -310,35 +338,30 @@ def test_a_stop_in_the_last_step_of_an_epoch_loses_no_validation(
             os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(CsvLogger, "log", log)
-    options = {"val_split": "val", "max_steps": 4, "pictures": 0}
-    assert not train(**logged(scenes, tmp_path / "parts", **options)).finished
-    parts = train(resume=True, **logged(scenes, tmp_path / "parts", **options))
-    straight = train(**logged(scenes, tmp_path / "straight", **options))
+    assert not train(**logged(scenes, tmp_path, **VALIDATED)).finished
+    parts = train(resume=True, **logged(scenes, tmp_path, **VALIDATED))
     assert parts.finished
     assert parts.metrics == straight.metrics
     assert read_card(parts.weights).metrics == read_card(straight.weights).metrics
-    same(state(tmp_path / "straight"), state(tmp_path / "parts"))
-    assert curves(tmp_path / "straight") == curves(tmp_path / "parts")
+    same(state(straight.folder), state(tmp_path))
+    assert curves(straight.folder) == curves(tmp_path)
 
 
 def test_a_stop_while_the_network_is_measured_waits_for_no_more_images(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, straight: TrainResult
 ) -> None:
-    options = {"val_split": "val", "max_steps": 4, "pictures": 0}
-    straight = train(**logged(scenes, tmp_path / "straight", **options))
-
     def stopped(network: TriLiteNet, dataset: DrivingDataset, device: str, progress: Any) -> dict[str, float]:
         os.kill(os.getpid(), signal.SIGTERM)
         return validation_figures(network, dataset, device, progress)
 
     with monkeypatch.context() as patch:
         patch.setattr("trilitenet.commands.train.validation_figures", stopped)
-        result = train(**logged(scenes, tmp_path / "parts", **options))
+        result = train(**logged(scenes, tmp_path, **VALIDATED))
     assert (result.finished, result.steps, result.metrics) == (False, 2, {})
-    parts = train(resume=True, **logged(scenes, tmp_path / "parts", **options))
+    parts = train(resume=True, **logged(scenes, tmp_path, **VALIDATED))
     assert parts.metrics == straight.metrics
-    same(state(tmp_path / "straight"), state(tmp_path / "parts"))
-    assert curves(tmp_path / "straight") == curves(tmp_path / "parts")
+    same(state(straight.folder), state(tmp_path))
+    assert curves(straight.folder) == curves(tmp_path)
 
 
 @pytest.mark.parametrize("what", ["validation", "anchors"])
@@ -410,8 +433,9 @@ def test_files_of_ones_own_are_left_alone(scenes: Path, tmp_path: Path) -> None:
     assert (tmp_path / "results" / "paper.csv").read_text() == "precious"
 
 
-def test_validation_keeps_the_best_and_the_page(scenes: Path, tmp_path: Path) -> None:
+def test_validation_keeps_the_best_and_the_page(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
+    monkeypatch.setattr("trilitenet.commands.train.write_results", write_results)
     options = logged(scenes, tmp_path, val_split="val", epochs=1, max_steps=2, auto_anchor=True, pictures=1)
     result = trilitenet.train(**options)
     assert set(result.best) <= {"detection", "drivable", "lane", "overall"}
@@ -451,6 +475,7 @@ def test_overwriting_leaves_nothing_of_the_earlier_run(
     options = logged(scenes, output, val_split="val", tasks=("drivable",), pictures=0)
     train(**options, max_steps=2)
     assert (output / "best-drivable.safetensors").exists()
+    (output / "results").mkdir()
     (output / "results" / "old.jpg").write_bytes(b"x")
     (output / "notes.txt").write_text("mine")
     (output / "last.ckpt").unlink()
@@ -566,7 +591,7 @@ def test_a_step_without_memory_is_told_in_one_line(
         train(**settings(scenes, tmp_path, max_steps=1))
 
 
-def test_refusals(scenes: Path, tmp_path: Path) -> None:
+def test_refusals(scenes: Path, tmp_path: Path, begun: Path) -> None:
     with pytest.raises(ConfigError, match="no data"):
         train()
     with pytest.raises(ConfigError, match="did you mean 'epochs'"):
@@ -599,13 +624,12 @@ def test_refusals(scenes: Path, tmp_path: Path) -> None:
         train_table(tmp_path / "t.yaml", data=scenes, output=tmp_path)
     with pytest.raises(WeightsError, match="no such checkpoint"):
         train(resume=True, **settings(scenes, tmp_path / "none"))
-    train(**settings(scenes, tmp_path, max_steps=1))
     with pytest.raises(OutputError, match="holds a run already"):
-        train(**settings(scenes, tmp_path, max_steps=1))
+        train(**settings(scenes, begun, max_steps=1))
     with pytest.raises(WeightsError, match="variant 'tiny', this run has 'small'"):
-        train(resume=True, **settings(scenes, tmp_path, max_steps=2, variant="small"))
+        train(resume=True, **settings(scenes, begun, max_steps=2, variant="small"))
     with pytest.raises(WeightsError, match="class count 1, this run has 2"):
-        train(resume=True, **settings(scenes, tmp_path, max_steps=2, classes=("vehicle", "person")))
+        train(resume=True, **settings(scenes, begun, max_steps=2, classes=("vehicle", "person")))
 
 
 def test_a_prepared_data_set_is_trained_on_without_validation(scenes: Path, tmp_path: Path) -> None:
@@ -643,12 +667,11 @@ def test_a_run_goes_on_with_its_own_data_alone(scenes: Path, tmp_path: Path) -> 
     assert train(**options | go_on | {"data": str(moved)}).steps == 2
 
 
-def test_a_checkpoint_that_does_not_name_its_data_is_taken(scenes: Path, tmp_path: Path) -> None:
-    train(**settings(scenes, tmp_path, max_steps=1))
-    whole = torch.load(tmp_path / "last.ckpt", weights_only=True)
+def test_a_checkpoint_that_does_not_name_its_data_is_taken(scenes: Path, begun: Path) -> None:
+    whole = torch.load(begun / "last.ckpt", weights_only=True)
     del whole["data"]
-    torch.save(whole, tmp_path / "last.ckpt")
-    assert train(resume=True, **settings(scenes, tmp_path, max_steps=2)).steps == 2
+    torch.save(whole, begun / "last.ckpt")
+    assert train(resume=True, **settings(scenes, begun, max_steps=2)).steps == 2
 
 
 @pytest.mark.parametrize("workers", [0, 1])
@@ -792,20 +815,19 @@ def test_resuming_takes_the_anchors_for_distillation_too(
 
 
 @pytest.mark.parametrize("part", ["network", "optimiser", "random"])
-def test_a_checkpoint_with_the_wrong_content_is_told_in_one_line(scenes: Path, tmp_path: Path, part: str) -> None:
-    train(**settings(scenes, tmp_path, max_steps=1))
-    path = tmp_path / "last.ckpt"
+def test_a_checkpoint_with_the_wrong_content_is_told_in_one_line(scenes: Path, begun: Path, part: str) -> None:
+    path = begun / "last.ckpt"
     whole = torch.load(path, weights_only=True)
     torch.save({**whole, part: {}}, path)
     with pytest.raises(WeightsError, match=r"last\.ckpt: does not fit this run") as caught:
-        train(resume=True, **settings(scenes, tmp_path, max_steps=2))
+        train(resume=True, **settings(scenes, begun, max_steps=2))
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("recipe", RECIPES, ids=lambda path: path.stem)
-def test_every_recipe_runs_three_steps(recipe: Path, scenes: Path, tmp_path: Path) -> None:
-    result = train(recipe, **settings(scenes, tmp_path, epochs=2, max_steps=3, batch_size=2))
-    assert result.steps == 3
+def test_every_recipe_runs_two_steps(recipe: Path, scenes: Path, tmp_path: Path) -> None:
+    result = train(recipe, **settings(scenes, tmp_path, epochs=2, max_steps=2, batch_size=2))
+    assert result.steps == 2
     assert recipe.read_text().startswith("# ")
     assert "Measured result" in recipe.read_text()
 
@@ -881,22 +903,20 @@ def test_two_processes_follow_one(scenes: Path, tmp_path: Path) -> None:
     curves = {}
     for devices in (1, 2):
         config = logged(scenes, tmp_path / str(devices), max_steps=6, devices=devices, lr=1e-3)
-        recipe = tmp_path / f"{devices}.yaml"
-        recipe.write_text(
-            yaml.safe_dump({key: list(value) if isinstance(value, tuple) else value for key, value in config.items()})
-        )
-        # The code is no script that could be run again by a second process.
-        done = subprocess.run(
-            [sys.executable, "-"],
-            input=f"import trilitenet; print(trilitenet.train({str(recipe)!r}).summary())",
-            check=False,
-            capture_output=True,
-            text=True,
-            timeout=280,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-        )
-        assert done.returncode == 0, done.stderr
-        assert done.stdout.count("finished after 6 steps") == 1
+        if devices == 1:
+            assert train(**config).finished
+        else:  # by code that is no script that could be run again by a second process
+            done = subprocess.run(
+                [sys.executable, "-"],
+                input=f"import trilitenet; print(trilitenet.train(**{config!r}).summary())",
+                check=False,
+                capture_output=True,
+                text=True,
+                timeout=280,
+                env={**os.environ, "OMP_NUM_THREADS": "1"},
+            )
+            assert done.returncode == 0, done.stderr
+            assert done.stdout.count("finished after 6 steps") == 1
         rows = read_csv(tmp_path / str(devices) / "metrics.csv")
         curves[devices] = [value for _, name, value in rows if name == "train/total"]
         parts = [value for step, name, value in rows if step == 1 and "train/" in name and name != "train/total"]
