@@ -19,7 +19,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar, overload
 
 import cv2
 import numpy as np
@@ -117,9 +117,10 @@ class Prefetch(Generic[T]):
             atexit.unregister(self.close)
 
 
-class PerceptionStream:
+class PerceptionStream(Generic[T]):
     """What a predictor sees in a source, in order: reading and inference run ahead in two threads.
 
+    It gives a `Perception` for each frame of a video; for each picture that, or a `Failure` if it cannot be used.
     Use it as a context manager, so that the threads end with the block. A live source never piles up: frames that come
     while the network is busy are left out.
 
@@ -129,20 +130,33 @@ class PerceptionStream:
         ahead: Batches that may wait between two stages.
     """
 
+    @overload
+    def __init__(
+        self: PerceptionStream[Perception], source: FrameReader, predictor: Predictor, *, ahead: int = 2
+    ) -> None: ...
+    @overload
+    def __init__(
+        self: PerceptionStream[Perception | Failure],
+        source: Stills | FrameReader,
+        predictor: Predictor,
+        *,
+        ahead: int = 2,
+    ) -> None: ...
+
     def __init__(self, source: Stills | FrameReader, predictor: Predictor, *, ahead: int = 2) -> None:
         self._source = source
         live = isinstance(source, FrameReader) and source.live
         batch_size = 1 if live else predictor.batch_size
         items: Iterable[Frame | Failure] = source
         self._frames = Prefetch(items, 1 if live else ahead * batch_size, drop_oldest=live)
-        self._perceptions = Prefetch(_perceive(self._frames, predictor, batch_size), ahead * batch_size)
+        self._perceptions: Prefetch[Any] = Prefetch(_perceive(self._frames, predictor, batch_size), ahead * batch_size)
 
     @property
     def dropped(self) -> int:
         """Frames of a live source that were left out so far."""
         return self._frames.dropped
 
-    def __iter__(self) -> Iterator[Perception | Failure]:
+    def __iter__(self) -> Iterator[T]:
         return self._perceptions
 
     def close(self) -> None:
@@ -152,7 +166,7 @@ class PerceptionStream:
         self._frames.close()
         self._perceptions.close()
 
-    def __enter__(self) -> PerceptionStream:
+    def __enter__(self) -> PerceptionStream[T]:
         return self
 
     def __exit__(
