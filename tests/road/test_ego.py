@@ -8,6 +8,7 @@ from trilitenet.processing.geometry import Camera
 from trilitenet.road.camera import CameraErrors
 from trilitenet.road.ego import (
     BOX_ERROR_SHARE,
+    MAX_DISTANCE_ERROR,
     REAR_OVERHANG,
     LaneFilter,
     LaneFit,
@@ -227,8 +228,9 @@ def test_a_vehicle_cut_off_below_is_no_lead_and_has_no_distance() -> None:
             np.full(1, 0.9, np.float32),
             np.zeros(1, np.int64),
         )
-        assert (find_lead(near, fit, CAMERA, CameraErrors()) is not None) == told
-        assert (find_distances(near, CAMERA, CameraErrors())[0] is not None) == told
+        distances = find_distances(near, CAMERA, CameraErrors())
+        assert (distances[0] is not None) == told
+        assert (find_lead(near, distances, fit, CAMERA) is not None) == told
 
 
 def test_lines_too_far_apart_or_too_near_are_no_lane() -> None:
@@ -252,10 +254,11 @@ def test_the_lead_is_the_nearest_in_the_lane_and_its_distance_that_of_its_rear()
     assert fit is not None
     for places in ([(15.0, 0.0), (25.0, 0.0), (10.0, 3.6)], [(25.0, 0.0), (15.0, 0.0), (10.0, 3.6)]):
         boxes = standing(*places)
-        lead = find_lead(boxes, fit, CAMERA, CameraErrors())
+        distances = find_distances(boxes, CAMERA, CameraErrors())
+        lead = find_lead(boxes, distances, fit, CAMERA)
         assert lead is not None
         assert places[lead.box] == (15.0, 0.0)
-        found = [one.value for one in find_distances(boxes, CAMERA, CameraErrors()) if one is not None]
+        found = [one.value for one in distances if one is not None]
         assert found == pytest.approx([ahead - REAR_OVERHANG for ahead, _ in places], abs=0.1)
         assert lead.distance.value == pytest.approx(15.0 - REAR_OVERHANG, abs=0.1)
 
@@ -268,7 +271,14 @@ def test_a_lorry_beside_that_the_edge_of_the_picture_cuts_is_no_lead() -> None:
         cut = Boxes(
             np.array([[0.0, 300.0, right, foot]], np.float32), np.full(1, 0.9, np.float32), np.zeros(1, np.int64)
         )
-        assert (find_lead(cut, fit, CAMERA, CameraErrors()) is not None) == leads
+        assert (find_lead(cut, find_distances(cut, CAMERA, CameraErrors()), fit, CAMERA) is not None) == leads
+
+
+def test_no_distance_is_told_whose_error_is_above_its_limit() -> None:
+    boxes = standing(*((float(ahead), 0.0) for ahead in np.linspace(60, 160, 400)))
+    told = [one for one in find_distances(boxes, CAMERA, CameraErrors()) if one is not None]
+    assert 0 < len(told) < 400
+    assert max(one.error / one.value for one in told) <= MAX_DISTANCE_ERROR
 
 
 @pytest.mark.parametrize(("track", "pause"), [(4, 0.05), (3, LeadFilter.GAP + 0.1)])

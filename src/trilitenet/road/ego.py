@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -360,28 +361,28 @@ def _lane_at(centre: GroundCurve, x: float) -> float:
     return centre.tangent(min(max(x, 0.0), centre.end), x)
 
 
-def find_lead(boxes: Boxes, fit: LaneFit, camera: Camera, errors: CameraErrors) -> LeadVehicle | None:
+def find_lead(boxes: Boxes, distances: Sequence[Estimate | None], fit: LaneFit, camera: Camera) -> LeadVehicle | None:
     """Return the nearest vehicle in the ego lane.
 
     Args:
         boxes: Vehicles, in pixels of the camera's picture, (0, 0) being the first pixel's corner.
+        distances: What `find_distances` tells of them.
         fit: The ego lane.
         camera: The camera.
-        errors: How well it is known.
 
     Returns:
         None without one, or if its distance cannot be told well enough.
     """
     if fit.centre is None or not len(boxes):
         return None
-    height, width = camera.size
+    width = camera.size[1]
     left, _, right, bottom = boxes.xyxy.T.astype(np.float64) - 0.5
     ground, left_end, right_end = (
         camera.to_ground(np.stack([column, bottom], axis=1)) for column in ((left + right) / 2, left, right)
     )
     best: LeadVehicle | None = None
-    for index, (x, y) in enumerate(ground.tolist()):
-        if not math.isfinite(x) or x <= 0 or bottom[index] >= height - 1.5:
+    for index, ((x, y), distance) in enumerate(zip(ground.tolist(), distances, strict=True)):
+        if distance is None or (best is not None and distance.value >= best.distance.value):
             continue
         middle = _lane_at(fit.centre, x)
         if left[index] < 1 or right[index] > width - 2:
@@ -390,14 +391,8 @@ def find_lead(boxes: Boxes, fit: LaneFit, camera: Camera, errors: CameraErrors) 
                 continue
         elif abs(y - middle) > IN_LANE * fit.half_width:
             continue
-        distance = x - REAR_OVERHANG
-        if distance <= 0.5 or (best is not None and distance >= best.distance.value):
-            continue
-        error = _distance_error(x, camera, errors, _box_error(boxes.xyxy[index], width))
-        if error > MAX_DISTANCE_ERROR * distance:
-            continue
         track = -1 if boxes.track_id is None else int(boxes.track_id[index])
-        best = LeadVehicle(index, track, Estimate(distance, error))
+        best = LeadVehicle(index, track, distance)
     return best
 
 
@@ -411,7 +406,7 @@ def find_distances(boxes: Boxes, camera: Camera, errors: CameraErrors) -> tuple[
         estimate = None
         if math.isfinite(x) and x > REAR_OVERHANG + 0.5 and row < height - 1.5:
             error = _distance_error(x, camera, errors, _box_error(box, width))
-            if error <= MAX_DISTANCE_ERROR * x:
+            if error <= MAX_DISTANCE_ERROR * (x - REAR_OVERHANG):
                 estimate = Estimate(x - REAR_OVERHANG, error)
         found.append(estimate)
     return tuple(found)

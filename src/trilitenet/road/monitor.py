@@ -88,7 +88,7 @@ class RoadMonitor:
         usual = CameraErrors() if self._calibration is None else self._calibration.errors
         fit = fit_ego_lane(*road.ego_lines, camera, errors, usual=usual, known_width=self._width)
         if fit is not None:
-            road = self._with_lane(road, fit, perception, camera, errors, timestamp)
+            road = self._with_lane(road, fit, perception, camera, timestamp)
         return self._with_events(road, perception, timestamp)
 
     def _prepare(self, size: tuple[int, int]) -> None:
@@ -130,9 +130,7 @@ class RoadMonitor:
                 errors = dataclasses.replace(errors, pitch=max(errors.pitch, away / camera.fy))
         return camera, errors, "file" if self._camera is not None else "lanes"
 
-    def _with_lane(
-        self, road: Road, fit: LaneFit, perception: Perception, camera: Camera, errors: CameraErrors, timestamp: float
-    ) -> Road:
+    def _with_lane(self, road: Road, fit: LaneFit, perception: Perception, camera: Camera, timestamp: float) -> Road:
         width = fit.lane.width
         if width is not None:
             past = self._width
@@ -140,7 +138,7 @@ class RoadMonitor:
             self._width = Estimate(mean, max(0.1, width.error))
         lead = None
         if perception.boxes is not None:
-            lead = find_lead(perception.boxes, fit, camera, errors)
+            lead = find_lead(perception.boxes, road.distances, fit, camera)
             if not self._still:
                 lead = self._lead.update(lead, perception.boxes, timestamp, camera)
         lane = fit.lane if self._still else self._lane.update(fit, timestamp)
