@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from trilitenet.commands.export import export
-from trilitenet.errors import OutputError
+from trilitenet.commands.export import Exported, export
+from trilitenet.errors import BackendError, OutputError
 
 
 def test_a_triton_repository_holds_a_checked_graph_and_the_card(traced: str, tmp_path: Path) -> None:
@@ -23,3 +23,14 @@ def test_a_triton_repository_holds_a_checked_graph_and_the_card(traced: str, tmp
     assert "tritonserver --model-repository" in exported.summary()
     with pytest.raises(OutputError, match="exists already"):
         export(str(weights), format="triton", output=tmp_path / "repository", size="64x128")
+
+
+def test_what_is_not_written_is_named_as_the_user_knows_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def keep(_network: object, _built: object, _info: object, path: Path, _checks: object) -> Exported:
+        raise BackendError(f"{path}: not written, it differs from the network")
+
+    monkeypatch.setattr("trilitenet.commands.export.build_onnx", lambda *_, **__: None)
+    monkeypatch.setattr("trilitenet.commands.export._keep", keep)
+    with pytest.raises(BackendError) as caught:
+        export("tiny", format="triton", output=tmp_path, size="64x96")
+    assert str(caught.value) == f"{tmp_path / 'tiny'}: not written, it differs from the network"

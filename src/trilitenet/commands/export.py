@@ -178,23 +178,27 @@ def export(
         raise ConfigError(f"{model} has no detection task, so there are no boxes to suppress; leave --nms out")
     if format == "triton":
         with scratch_folder() as folder:
-            exported = export(
-                model,
-                format="onnx",
-                output=folder / "model.onnx",
-                precision=precision,
-                size=size,
-                calibration=calibration,
-                calibration_frames=calibration_frames,
-                max_drop=max_drop,
-                nms=nms,
-                portable=portable,
-                masks=masks,
-                mask_scale=mask_scale,
-                bgr=bgr,
-                layout=layout,
-                frames=frames,
-            )
+            graph_path = folder / "model.onnx"
+            try:
+                exported = export(
+                    model,
+                    format="onnx",
+                    output=graph_path,
+                    precision=precision,
+                    size=size,
+                    calibration=calibration,
+                    calibration_frames=calibration_frames,
+                    max_drop=max_drop,
+                    nms=nms,
+                    portable=portable,
+                    masks=masks,
+                    mask_scale=mask_scale,
+                    bgr=bgr,
+                    layout=layout,
+                    frames=frames,
+                )
+            except BackendError as error:  # it names the graph, which goes with its folder
+                raise BackendError(str(error).replace(str(graph_path), str(path))) from error
             with uninterrupted():  # the former model has gone before the new one comes
                 write_triton_repository(exported.path, path.parent, network.card, name=path.name, overwrite=overwrite)
         serve = f"Serve it with: tritonserver --model-repository {path.parent.resolve()}"
