@@ -76,6 +76,13 @@ def test_what_is_asked_of_openvino_reaches_it(artefacts: Artefacts) -> None:
         trilitenet.load(artefacts.folder / "model.xml", backend="torch")
 
 
+def test_another_size_than_an_artefact_takes_is_refused(artefacts: Artefacts) -> None:
+    file = artefacts.folder / "model.onnx"
+    with pytest.raises(ConfigError, match=f"model.onnx: its input is fixed to {SIZE[1]}x{SIZE[0]}"):
+        trilitenet.load(file, long_side=1280)
+    assert trilitenet.load(file, long_side=max(SIZE)).backend.canvas == SIZE
+
+
 def test_masks_that_are_decided_inside_take_no_thresholds(artefacts: Artefacts) -> None:
     assert trilitenet.load(artefacts.folder / "model.onnx", confidence=0.6).thresholds.confidence == 0.6
     with pytest.raises(ConfigError, match="--masks probability"):

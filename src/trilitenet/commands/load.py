@@ -56,7 +56,8 @@ def load(
         iou: A box goes when it overlaps a better one by more, in [0, 1]; the model's own if left out.
         drivable: A pixel is drivable above this probability, in [0, 1]; the model's own if left out.
         lane: A pixel is lane marking above this probability, in [0, 1]; the model's own if left out.
-        long_side: The longer side of an image is resized to so many pixels; by default as in training.
+        long_side: The longer side of an image is resized to so many pixels; by default as in training, or as the input
+            of an artefact is fixed to.
         batch_size: At most so many images go through the network at once.
         streams: Images that OpenVINO computes at once: more frames a second, more latency.
         threads: Threads of the runtime; its own choice if left out. PyTorch has one number for the whole process.
@@ -68,7 +69,7 @@ def load(
         WeightsError: If the file is missing, broken or foreign.
         BackendError: If the device or the runtime is not there.
         MissingExtraError: If the runtime is not installed.
-        ConfigError: If an option is unknown or out of range.
+        ConfigError: If an option is unknown, out of range, or of no effect on this model's input.
     """
     if backend not in BACKENDS:
         raise ConfigError(f"unknown backend {backend!r}{did_you_mean(backend, BACKENDS)}")
@@ -76,6 +77,12 @@ def load(
     with needing_torch():
         runtime = open_backend(model, device, backend, streams, threads)
     try:
+        if long_side is not None and runtime.canvas is not None and long_side != max(runtime.canvas):
+            height, width = runtime.canvas
+            raise ConfigError(
+                f"its input is fixed to {width}x{height}, so long_side has no effect; leave it out, or export it with "
+                "another --size"
+            )
         thresholds = _override(runtime.card, confidence=confidence, iou=iou, drivable=drivable, lane=lane)
         return Predictor(runtime, thresholds, long_side=long_side, batch_size=batch_size)
     except ConfigError as error:
