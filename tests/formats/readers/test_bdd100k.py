@@ -127,6 +127,17 @@ def test_index_of_a_large_file_survives_chunk_borders(tmp_path: Path, monkeypatc
     assert pieces.objects == whole.objects
 
 
+def test_label_files_of_other_names_are_told(tmp_path: Path) -> None:
+    raw_bdd.write_images(tmp_path)
+    raw_bdd.write_2020(tmp_path)
+    assert not [line for line in read_bdd100k(tmp_path).found if "not read" in line]
+    path = tmp_path / "labels/det_20/det_train.json"
+    path.rename(path.with_name("det_v2_train_release.json"))
+    source = read_bdd100k(tmp_path)
+    assert source.record("train", "a1").objects is None
+    assert source.found[-1].endswith("no images): labels/det_20/det_v2_train_release.json")
+
+
 def test_errors_name_the_file(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no such folder"):
         read_bdd100k(tmp_path / "nowhere")

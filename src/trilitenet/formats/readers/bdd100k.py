@@ -156,6 +156,7 @@ def read_bdd100k(raw: str | Path, *, crosswalk: bool = False, vertical: bool = F
     folders, files = _survey(root)
     splits: dict[str, _Split] = {}
     found: list[str] = []
+    read: set[Path] = set()
     for split in BDD100K_SPLITS:
         images = _images(folders, split)
         if not images:
@@ -177,6 +178,7 @@ def read_bdd100k(raw: str | Path, *, crosswalk: bool = False, vertical: bool = F
         splits[split] = _Split(
             images, {name: tuple(items) for name, items in parts.items()}, documents, drivable, lane, tasks
         )
+        read |= tasks.keys()
         sources = [f"{path.relative_to(root)} ({', '.join(sorted(tasks[path])) or 'nothing'})" for path in tasks]
         sources += [f"{path.relative_to(root)} (masks)" for path in (drivable and drivable[0], lane) if path]
         found.append(f"{split}: {len(images)} images; labels from {', '.join(sources) or 'nowhere'}")
@@ -185,6 +187,10 @@ def read_bdd100k(raw: str | Path, *, crosswalk: bool = False, vertical: bool = F
             f"{root}: no BDD100K images; looked for folders images/100k/{{train,val,test}} (or images/train, ...) with "
             ".jpg files at any depth"
         )
+    others = [str(path.relative_to(root)) for path in sorted(files) if not read & {path, path.parent}]
+    if others:
+        rest = f" and {len(others) - 3} more" if len(others) > 3 else ""
+        found.append(f"not read (no label file has that name, or its split no images): {', '.join(others[:3])}{rest}")
     return BddSource(root, splits, tuple(found), crosswalk=crosswalk, vertical=vertical)
 
 
