@@ -172,6 +172,9 @@ def test_description_round_trip(tmp_path: Path) -> None:
 def test_errors_name_the_file(root: Path) -> None:
     with pytest.raises(DataError, match="no folder images/val"):
         DrivingDataset(root, "val")
+    (root / "prepared.json").touch()
+    with pytest.raises(DataError, match="a prepared copy, for training alone"):
+        DrivingDataset(root, "val")
     with pytest.raises(DataError, match="no image 'x'"):
         DrivingDataset(root, "train", names=["x"])
     (root / "images/empty").mkdir()

@@ -40,6 +40,7 @@ from trilitenet.data.reading import (
     IMAGE_ENDINGS,
     IMAGE_FOLDER,
     LABEL_FILES,
+    PREPARED_FILE,
     DrivingDataset,
     SampleSource,
     decode_image,
@@ -50,11 +51,10 @@ from trilitenet.errors import ConfigError, DataError, OutputError, import_extra,
 from trilitenet.processing.cores import ProcessPool
 from trilitenet.processing.letterbox import Letterbox
 
-__all__ = ["PREPARED_FILE", "PreparedDataset", "is_prepared", "open_dataset", "prepare", "shrink"]
+__all__ = ["PreparedDataset", "is_prepared", "open_dataset", "prepare", "shrink"]
 
 _logger = logging.getLogger(__name__)
 
-PREPARED_FILE: Final = "prepared.json"
 CACHE_FOLDER: Final = ".prepared"
 """A prepared copy in this folder of a data set is used by itself."""
 FORMAT: Final = 1

@@ -36,6 +36,7 @@ __all__ = [
     "IMAGE_ENDINGS",
     "IMAGE_FOLDER",
     "LABEL_FILES",
+    "PREPARED_FILE",
     "DrivingDataset",
     "MixedDataset",
     "SampleSource",
@@ -52,6 +53,8 @@ __all__ = [
 _LOGGER: Final = logging.getLogger(__name__)
 
 IMAGE_FOLDER: Final = "images"
+PREPARED_FILE: Final = "prepared.json"
+"""Of a copy made for training, which is read by `trilitenet.data.prepared`."""
 LABEL_FILES: Final[dict[Task, tuple[str, str]]] = {
     "detection": ("det_annotations", ".json"),
     "drivable": ("da_seg_annotations", ".png"),
@@ -509,6 +512,8 @@ def _image_files(root: Path, split: str) -> dict[str, str]:
     """Return image name -> file name of a split."""
     folder = root / IMAGE_FOLDER / split
     if not folder.is_dir():
+        if (root / PREPARED_FILE).is_file():
+            raise DataError(f"{root}: a prepared copy, for training alone; name the data set it was made from")
         raise DataError(f"{root}: no folder {IMAGE_FOLDER}/{split}; expected the published layout, see docs/data.md")
     files: dict[str, str] = {}
     for file in sorted(path.name for path in folder.iterdir()):  # as text, which is many times as fast
