@@ -4,6 +4,8 @@ import errno
 import json
 import os
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -149,3 +151,12 @@ def test_an_import_that_is_interrupted_is_not_taken_for_a_missing_extra(
         import_extra("stopped_runtime", "runtime")
     with pytest.raises(MissingExtraError, match=r"pip install 'trilitenet\[runtime\]'"):
         import_extra("no_such_runtime", "runtime")
+
+
+def test_openvino_is_imported_without_what_reports_its_use(tmp_path: Path) -> None:
+    pytest.importorskip("openvino")
+    program = "from trilitenet.errors import import_extra; import_extra('openvino', 'openvino'); import sys; "
+    program += "assert 'openvino_telemetry' not in sys.modules; import openvino_telemetry"
+    environment = {**{name: value for name, value in os.environ.items() if name != "CI"}, "HOME": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", program], env=environment, check=True)
+    assert not list(tmp_path.iterdir())  # where the reports keep who they are of

@@ -23,6 +23,7 @@ import importlib
 import os
 import secrets
 import stat
+import sys
 import tempfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
@@ -55,6 +56,8 @@ __all__ = [
     "writing",
 ]
 
+_REPORTER: Final = "openvino_telemetry"
+"""The package that tells the makers of OpenVINO and NNCF of each use."""
 LONGEST_NAME: Final = 255
 """Bytes of a file name that every file system takes."""
 _BEGINNING: Final = 40
@@ -128,7 +131,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def import_extra(module: str, extra: str) -> ModuleType:
-    """Import an optional dependency.
+    """Import an optional dependency, without what reports each use of it to its maker.
 
     Args:
         module: The module to import, for example ``"av"``.
@@ -138,13 +141,27 @@ def import_extra(module: str, extra: str) -> ModuleType:
         MissingExtraError: If it is not installed; the message names the extra.
     """
     try:
-        return importlib.import_module(module)
+        with _unreported():
+            return importlib.import_module(module)
     except ImportError as error:
         if isinstance(error.__cause__, KeyboardInterrupt):  # pybind11's modules make an ImportError of it
             raise error.__cause__ from None
         raise MissingExtraError(
             f"this needs {module!r} ({error}); install it with: pip install 'trilitenet[{extra}]'"
         ) from error
+
+
+@contextlib.contextmanager
+def _unreported() -> Iterator[None]:
+    """Inside, OpenVINO and NNCF are imported as where the package that reports their use is not installed."""
+    if _REPORTER in sys.modules:  # somebody else has imported them
+        yield
+        return
+    sys.modules[_REPORTER] = None  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        sys.modules.pop(_REPORTER, None)
 
 
 @contextlib.contextmanager
