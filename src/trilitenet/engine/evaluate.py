@@ -521,13 +521,15 @@ def _look_at_each(
         if progress is not None:
             progress(next(done), count)
 
-    with backend.in_parallel() if isinstance(backend, RunsInParallel) else nullcontext(1) as runners:
-        read = _ahead(prepare, range(count), batch_size * (runners + 1) + 1, "reader")
-        outputs = closing(_ahead(run, _batches(read, batch_size), runners, "network", runners))
-        with outputs as batches, _InOrder() as looking:
-            for batch, raw in batches:
-                for index, (sample, _, letterbox) in enumerate(batch):
-                    looking.submit(look_at, sample, raw, index, letterbox)
+    with (
+        backend.in_parallel() if isinstance(backend, RunsInParallel) else nullcontext(1) as runners,
+        closing(_ahead(prepare, range(count), batch_size * (runners + 1) + 1, "reader")) as read,
+        closing(_ahead(run, _batches(read, batch_size), runners, "network", runners)) as outputs,
+        _InOrder() as looking,
+    ):
+        for batch, raw in outputs:
+            for index, (sample, _, letterbox) in enumerate(batch):
+                looking.submit(look_at, sample, raw, index, letterbox)
 
 
 def _batches(read: Iterable[_Read], batch_size: int) -> Iterator[list[_Read]]:

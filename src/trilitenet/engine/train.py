@@ -258,6 +258,7 @@ class Trainer:
 
         Raises:
             DataError: If an image or label cannot be read.
+            OutputError: If a result cannot be written.
             TrainingError: If the loss or gradient is not finite ten steps in a row, the device is out of memory, or a
                 process that reads images was killed.
             WeightsError: If the checkpoint is damaged or of another run.
