@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.errors import ShapeError
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 __all__ = ["SCHEMA_VERSION", "Boxes", "Perception", "RawOutputs"]
 
@@ -153,18 +157,20 @@ class Perception:
 
         return perception_from_dict(mapping)
 
-    def draw(self, image: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+    def draw(self, image: str | Path | bytes | Image.Image | NDArray[Any] | None = None) -> NDArray[np.uint8]:
         """Return a copy of the image with the three tasks drawn on it.
 
         Args:
-            image: (height, width, 3) uint8 RGB to draw on; the source image if left out.
+            image: What to draw on, in any form that a predictor takes; the source image if left out.
 
         Returns:
             (height, width, 3) uint8 RGB.
 
         Raises:
+            InputError: If an image cannot be read.
             ShapeError: If there is no image, or one of another size.
         """
         from trilitenet.processing.drawing import draw
+        from trilitenet.processing.images import read_image
 
-        return draw(self, image)
+        return draw(self, None if image is None else read_image(image))

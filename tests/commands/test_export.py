@@ -68,6 +68,7 @@ def test_options_that_do_not_fit(artefacts: Artefacts, tmp_path: Path) -> None:
         ({"precision": "int8", "calibration": tmp_path, "size": "dynamic"}, "int8 needs a fixed --size"),
         ({"format": "ncnn", "precision": "bf16"}, "ncnn artefacts come as fp32, fp16, not bf16"),
         ({"format": "ncnn", "size": "dynamic"}, "ncnn needs a fixed --size"),
+        ({"format": "ncnn", "mask_scale": 2}, "--mask-scale doubles masks that are decided"),
         ({"format": "ncnn", "output": tmp_path / "a.param"}, "end with .ncnn.param"),
         ({"format": "tensorrt", "output": Path()}, "end with .engine"),
         ({"precision": "int8", "calibration": tmp_path, "calibration_frames": -3}, "must be at least 1, got -3"),

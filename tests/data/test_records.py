@@ -65,6 +65,8 @@ def test_a_damaged_exif_leaves_the_size_readable(tmp_path: Path, exif: bytes) ->
         (["x/1.jpg", "x/1.png", "y/1.jpg"], ["1", "1", "y-1"]),
         (["x/y-1.jpg", "y/1.jpg", "z/1.jpg"], ["x-y-1", "y-1", "z-1"]),
         (["p/x/1.jpg", "p/x/1.jpg"], ["1"]),
+        (["x/A.jpg", "y/a.jpg"], ["x-A", "y-a"]),
+        (["x/A.jpg", "x/a.png", "x/b.jpg"], ["A", "a", "b"]),
     ],
 )
 def test_images_of_one_name_get_their_folders(images: list[str], names: list[str]) -> None:

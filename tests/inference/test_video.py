@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests.fakes import ColourBackend, coloured_scene
-from trilitenet.errors import BackendError, InputError, OutputError, ShapeError
+from trilitenet.errors import BackendError, ConfigError, InputError, OutputError, ShapeError
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Failure, Frame, FrameReader, Stills, VideoReader
 from trilitenet.inference.video import PerceptionStream, Prefetch, VideoWriter
@@ -287,6 +287,16 @@ def test_a_frame_after_the_end_is_refused(tmp_path: Path) -> None:
         writer.write(coloured_scene(32, 32))
     writer.close()
     assert (tmp_path / "a.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "rate", "told"), [("a.avi", None, r"a\.avi: .* as \.mp4"), ("a.mp4", -1.0, "above 0, got -1")]
+)
+def test_a_video_of_another_kind_or_without_time_is_refused(
+    tmp_path: Path, name: str, rate: float | None, told: str
+) -> None:
+    with pytest.raises(ConfigError, match=told):
+        VideoWriter(tmp_path / name, rate)
 
 
 def test_a_frame_that_is_no_picture_takes_nothing_from_the_video(tmp_path: Path) -> None:

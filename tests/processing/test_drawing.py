@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from PIL import Image
 
 from trilitenet.errors import ConfigError, ShapeError
 from trilitenet.processing.drawing import BOX_COLOURS, DRIVABLE_COLOUR, LANE_COLOUR, draw, draw_label
@@ -76,6 +78,17 @@ def test_nothing_seen_is_the_image() -> None:
     perception = Perception(size=(40, 50), boxes=Boxes.empty(), drivable=empty, lane=empty)
     np.testing.assert_array_equal(perception.draw(image), image)
     np.testing.assert_array_equal(Perception(size=(40, 50)).draw(image), image)
+    np.testing.assert_array_equal(perception.draw(Image.fromarray(image)), image)
+
+
+def test_a_box_of_any_size_is_drawn() -> None:
+    def picture(far: float) -> NDArray[np.uint8]:
+        xyxy = np.array([[-far, 10.0, 20.0, far]], np.float32)
+        boxes = Boxes(xyxy, np.array([0.9], np.float32), np.array([0]))
+        return Perception(size=(40, 50), boxes=boxes, class_names=("car",)).draw(np.zeros((40, 50, 3), np.uint8))
+
+    assert picture(100.0).any()
+    np.testing.assert_array_equal(picture(1e30), picture(100.0))
 
 
 @pytest.mark.parametrize("corner", [(-50, -50), (0, 0), (95, 3), (500, 500), (50, 99)])

@@ -170,7 +170,9 @@ def export(
     """
     portable = portable or format in ("ncnn", "tensorrt")
     parsed = _parse_size(size)
-    _check_options(format, precision, parsed, calibration, calibration_frames, max_drop, nms, portable, masks, layout)
+    _check_options(
+        format, precision, parsed, calibration, calibration_frames, max_drop, nms, portable, masks, mask_scale, layout
+    )
     path = _destination(model, format, output)
     _check_files(path, format, overwrite)
     network = load_network(model).eval()
@@ -252,6 +254,7 @@ def _check_options(
     nms: bool,
     portable: bool,
     masks: Masks | None,
+    mask_scale: int,
     layout: str,
 ) -> None:
     """Refuse options that do not fit each other."""
@@ -280,6 +283,8 @@ def _check_options(
         raise ConfigError(
             f"masks of ncnn, tensorrt and --portable are logits; give --masks logit or leave it out, not {masks}"
         )
+    if portable and mask_scale != 1:
+        raise ConfigError("--mask-scale doubles masks that are decided; ncnn, tensorrt and --portable give logits")
 
 
 def check_drop(max_drop: float | None) -> None:

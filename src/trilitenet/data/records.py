@@ -233,18 +233,19 @@ def image_size(path: Path) -> tuple[int, int]:
 def name_apart(images: Iterable[Path]) -> dict[Path, str]:
     """Return each image's name: its stem, after as many of its folders as tell it from the others (``day1-0001``).
 
-    Images that differ in their ending alone have one name.
+    Images that differ in their ending alone have one name. Case tells none apart, as on Windows and macOS.
     """
     depths = dict.fromkeys(images, 0)
-    alike = Counter(path.with_suffix("") for path in depths)
+    places = {path: str(path.with_suffix("")).casefold() for path in depths}
+    alike = Counter(places.values())
     while True:
         names = {path: "-".join((*path.parts[-1 - depth : -1], path.stem)) for path, depth in depths.items()}
-        counts = Counter(names.values())
+        counts = Counter(map(str.casefold, names.values()))
         longer = [
             path
             for path, name in names.items()
-            if counts[name] > 1
-            and alike[path.with_suffix("")] == 1
+            if counts[name.casefold()] > 1
+            and alike[places[path]] == 1
             and depths[path] < len(path.relative_to(path.anchor).parent.parts)
         ]
         if not longer:

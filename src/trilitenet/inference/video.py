@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.errors import InputError, OutputError, ShapeError, import_extra, part_of
+from trilitenet.errors import ConfigError, InputError, OutputError, ShapeError, import_extra, part_of
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Failure, Frame, FrameReader, Stills
 from trilitenet.processing.images import to_rgb
@@ -240,6 +240,7 @@ class VideoWriter:
         pixel_aspect: Width of a pixel by its height, None for squares; to be set before the first frame.
 
     Raises:
+        ConfigError: If the path does not end in ``.mp4``, or the rate is not above 0.
         MissingExtraError: If PyAV is not installed.
     """
 
@@ -254,6 +255,10 @@ class VideoWriter:
     ) -> None:
         self._av = import_extra("av", "video")
         self.path = path = Path(path)
+        if path.suffix.lower() != ".mp4":
+            raise ConfigError(f"{path}: a video is written as .mp4")
+        if rate is not None and rate <= 0:
+            raise ConfigError(f"{path}: frames a second must be above 0, got {rate:g}")
         self.frames = 0
         self.pixel_aspect: Fraction | None = None
         self._partial = part_of(path)

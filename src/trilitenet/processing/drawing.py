@@ -165,11 +165,12 @@ def draw_boxes(canvas: NDArray[np.uint8], boxes: Boxes, class_names: tuple[str, 
     """
     height, width = canvas.shape[:2]
     thickness = max(1, round(max(height, width) / 400))
+    corners = np.clip(boxes.xyxy, -2 * thickness, max(height, width) + 2 * thickness)  # OpenCV counts to 2**31
     for i in range(len(boxes) - 1, -1, -1):
         track = -1 if boxes.track_id is None else int(boxes.track_id[i])
         class_id = int(boxes.class_id[i])
         colour = BOX_COLOURS[(track if track >= 0 else class_id) % len(BOX_COLOURS)]
-        left, top, right, bottom = (round(float(value)) for value in boxes.xyxy[i])
+        left, top, right, bottom = (round(float(value)) for value in corners[i])
         cv2.rectangle(canvas, (left, top), (right, bottom), colour, thickness)
         if labels:
             words = [class_names[class_id]] if len(class_names) > 1 else []
