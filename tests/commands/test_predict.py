@@ -114,7 +114,7 @@ def test_the_command_line(folder: Path, tmp_path: Path, weights: Path, capsys: p
 
 
 def test_texts_do_in_python(folder: Path, tmp_path: Path, predictor: Predictor) -> None:
-    report = predict_with(predictor, str(folder / "photo.jpg"), str(tmp_path / "out"), format="coco", hide="labels")  # type: ignore[arg-type]
+    report = predict_with(predictor, str(folder / "photo.jpg"), str(tmp_path / "out"), format="coco", hide="labels")
     assert report.images == 1
     assert (tmp_path / "out" / "coco.json").is_file()
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 import trilitenet
 from trilitenet.commands.load import check_parallel, load
-from trilitenet.commands.paths import check_writable, text_paths
+from trilitenet.commands.paths import StrPath, check_writable, one_for_several, optional_path
 from trilitenet.config import VARIANTS, check_size
 from trilitenet.engine.provenance import peak_memory
 from trilitenet.errors import ConfigError, import_extra, write_file
@@ -135,7 +135,7 @@ class Benchmark:
         return "\n".join(lines)
 
 
-@text_paths
+@one_for_several
 def benchmark(
     *models: str,
     backend: Sequence[str] = ("auto",),
@@ -149,8 +149,8 @@ def benchmark(
     device: str = "auto",
     streams: int = 1,
     threads: int | None = None,
-    output: Path | None = None,
-    plot: Path | None = None,
+    output: StrPath | None = None,
+    plot: StrPath | None = None,
 ) -> Benchmark:
     """Measure latency, its tail, frames a second, first-result time and energy of models and runtimes, in turn.
 
@@ -178,6 +178,7 @@ def benchmark(
         OutputError: If a file cannot be written.
         MissingExtraError: If the extra ``evaluate`` is not installed, for a plot.
     """
+    output, plot = optional_path(output), optional_path(plot)
     if not backend or not batch:
         raise ConfigError("nothing to measure: name at least one --backend and one --batch")
     if min(rounds, *batch) < 1 or warmup < 0:

@@ -6,7 +6,7 @@ from collections import Counter
 from pathlib import Path
 
 from trilitenet.commands.evaluate import check_counts, check_output
-from trilitenet.commands.paths import text_paths
+from trilitenet.commands.paths import StrPath, optional_path
 from trilitenet.engine.compare import Comparison, compare_reports
 from trilitenet.engine.report import Report, read_report
 from trilitenet.errors import ConfigError
@@ -14,11 +14,10 @@ from trilitenet.errors import ConfigError
 __all__ = ["compare"]
 
 
-@text_paths
 def compare(
-    *reports: Path,
+    *reports: StrPath,
     published: bool = False,
-    output: Path | None = None,
+    output: StrPath | None = None,
     overwrite: bool = False,
     resamples: int = 1000,
 ) -> Comparison:
@@ -41,13 +40,15 @@ def compare(
     if not reports:
         raise ConfigError("give at least one report.json, or a folder that holds one")
     check_counts(resamples)
+    output = optional_path(output)
     check_output(output, overwrite, "comparison.json")
-    files = [path / "report.json" if path.is_dir() else path for path in reports]
+    paths = list(map(Path, reports))
+    files = [path / "report.json" if path.is_dir() else path for path in paths]
     repeated = [path for path, count in Counter(file.resolve() for file in files).items() if count > 1]
     if repeated:
         raise ConfigError(f"{repeated[0]}: given more than once; give each report once")
     named: dict[str, Report] = {}
-    for path, file in zip(reports, files, strict=True):
+    for path, file in zip(paths, files, strict=True):
         report = read_report(file)
         name = Path(report.provenance.model).name or report.provenance.model
         if name in named:

@@ -16,7 +16,7 @@ from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 
-from trilitenet.commands.paths import text_paths
+from trilitenet.commands.paths import StrPath, one_for_several, optional_path
 from trilitenet.commands.progress import show_progress
 from trilitenet.data.check_page import check_page, picture_page
 from trilitenet.data.checking import KINDS, CheckReport, check_dataset, detect_layout
@@ -86,15 +86,15 @@ class Converted:
         return "\n".join([*lines, f"written to {self.output}"])
 
 
-@text_paths
+@one_for_several
 def convert(
     source: str,
-    output: Path,
-    target: Path | None = None,
+    output: StrPath,
+    target: StrPath | None = None,
     /,
     *,
     kind: Annotated[Literal["bdd100k", "coco", "yolo", "cvat", "masks"] | None, Parameter(name="--from")] = None,
-    classes: Path | None = None,
+    classes: StrPath | None = None,
     splits: Sequence[str] = (),
     lane_width: Sequence[str] = (),
     crosswalk: bool = False,
@@ -208,12 +208,11 @@ class Checked:
         return "\n".join([*lines, *(f"written: {path}" for path in self.files)])
 
 
-@text_paths
 def check(
-    root: Path,
+    root: StrPath,
     *,
-    json_file: Annotated[Path | None, Parameter(name="--json")] = None,
-    html: Path | None = None,
+    json_file: Annotated[StrPath | None, Parameter(name="--json")] = None,
+    html: StrPath | None = None,
     pictures: int = 24,
     workers: int = 0,
 ) -> Checked:
@@ -233,6 +232,7 @@ def check(
     with show_progress("images") as advance:
         report = check_dataset(root, workers=_workers(workers), progress=advance)
     files: list[Path] = []
+    json_file, html = optional_path(json_file), optional_path(html)
     if json_file is not None:
         write_file(json_file, json.dumps(report.to_dict(), indent=1, ensure_ascii=False))
         files.append(json_file)
@@ -259,10 +259,10 @@ class Shown:
         return f"{self.count} images on {self.output}"
 
 
-@text_paths
+@one_for_several
 def show(
-    root: Path,
-    output: Path,
+    root: StrPath,
+    output: StrPath,
     *,
     split: str = "",
     where: Sequence[str] = (),
@@ -292,6 +292,7 @@ def show(
         DataError: If there is no such split, or no such image.
         OutputError: If the ending of ``output`` is none of these.
     """
+    root, output = Path(root), Path(output)
     if output.suffix.lower() not in {".jpg", ".jpeg", ".png", ".html"}:
         raise OutputError(f"{output}: must end in .jpg, .png or .html")
     numbers = (
@@ -358,10 +359,10 @@ class Prepared:
         return f"{counts} in {self.output} ({self.size / 2**20:.1f} MiB); {use}"
 
 
-@text_paths
+@one_for_several
 def prepare(
-    root: Path,
-    output: Path | None = None,
+    root: StrPath,
+    output: StrPath | None = None,
     *,
     size: tuple[int, int] = (384, 640),
     splits: Sequence[str] = (),
@@ -406,12 +407,12 @@ def prepare(
             workers=_workers(workers),
             progress=advance,
         )
-    folder = output or root / CACHE_FOLDER
+    folder = Path(root, CACHE_FOLDER) if output is None else Path(output)
     total = sum(path.stat().st_size for path in folder.iterdir())
     return Prepared(folder, counts, total, by_itself=output is None)
 
 
-def _arguments(source: str, output: Path, target: Path | None, kind: str | None) -> tuple[str, str, Path]:
+def _arguments(source: str, output: StrPath, target: StrPath | None, kind: str | None) -> tuple[str, str, Path]:
     """Return (kind, what to convert, where to) of either way to say it."""
     if kind is None:
         if target is None:
@@ -422,7 +423,7 @@ def _arguments(source: str, output: Path, target: Path | None, kind: str | None)
     known = ("bdd100k", "coco", "yolo", "cvat", "masks")
     if kind not in known:
         raise ConfigError(f"unknown kind of data set {kind!r}; known: {', '.join(known)}")
-    return kind, source, output
+    return kind, source, Path(output)
 
 
 def _open_source(

@@ -20,7 +20,7 @@ from trilitenet.commands.export import (
     export,
     find_pictures,
 )
-from trilitenet.commands.paths import check_writable, text_paths
+from trilitenet.commands.paths import StrPath, check_writable, one_for_several
 from trilitenet.commands.tables import PAPER_COLUMNS, markdown_row
 from trilitenet.config import ARTEFACT_SUFFIXES, VARIANTS
 from trilitenet.data.reading import DrivingDataset
@@ -107,16 +107,16 @@ class PrecisionTable:
         return lines
 
 
-@text_paths
+@one_for_several
 def evaluate_table(
     *models: str,
-    data: Path,
-    output: Path,
+    data: StrPath,
+    output: StrPath,
     precisions: Sequence[Precision] | None = None,
     format: Literal["openvino", "onnx"] = "openvino",
     size: str = "384x640",
     split: str = "val",
-    calibration: Path | None = None,
+    calibration: StrPath | None = None,
     calibration_frames: int = 500,
     max_drop: float | None = None,
     limit: int | None = None,
@@ -149,6 +149,7 @@ def evaluate_table(
         ConfigError: If there is no precision, the format lacks one, or there shall be no calibration frames.
         OutputError: If the output folder cannot be written to.
     """
+    output, calibration = Path(output), Path(data if calibration is None else calibration)
     precisions = PRECISIONS[format] if precisions is None else precisions
     if not precisions:
         raise ConfigError("name at least one of --precisions fp32 fp16 bf16 int8")
@@ -165,7 +166,7 @@ def evaluate_table(
     check_writable(output / "precisions.md")
     int8 = ""
     if "int8" in precisions:
-        int8 = f"-{calibration_frames}-{_hash_calibration(calibration or data, calibration_frames, max_drop)[:12]}"
+        int8 = f"-{calibration_frames}-{_hash_calibration(calibration, calibration_frames, max_drop)[:12]}"
         int8 += "" if max_drop is None else f"-drop{max_drop:g}"
     rows: list[PrecisionRow] = []
     hashes: dict[tuple[str, ...], dict[str, str]] = {}  # the classes decide what labels mean
@@ -193,7 +194,7 @@ def evaluate_table(
                         output=artefact,
                         precision=precision,
                         size=size,
-                        calibration=(calibration or data) if precision == "int8" else None,
+                        calibration=calibration if precision == "int8" else None,
                         calibration_frames=calibration_frames,
                         max_drop=max_drop if precision == "int8" else None,
                         masks="probability",  # the protocols decide by thresholds of their own

@@ -18,7 +18,7 @@ from torch.nn.functional import interpolate
 
 import trilitenet
 from trilitenet.commands.load import open_backend
-from trilitenet.commands.paths import check_writable, text_paths
+from trilitenet.commands.paths import StrPath, check_writable, optional_path
 from trilitenet.config import ARTEFACT_KEY, ARTEFACT_SUFFIXES, CARD_KEY, ArtefactInfo, Task, check_size
 from trilitenet.data.reading import IMAGE_ENDINGS, DrivingDataset
 from trilitenet.deploy.graph import DeployGraph, Masks, Traceable
@@ -112,16 +112,15 @@ class Exported:
         return "\n".join((*lines, *self.notes))
 
 
-@text_paths
 def export(
     model: str = "tiny",
     /,
     *,
     format: Format = "onnx",
-    output: Path | None = None,
+    output: StrPath | None = None,
     precision: Precision = "fp32",
     size: str = "384x640",
-    calibration: Path | None = None,
+    calibration: StrPath | None = None,
     calibration_frames: int = 500,
     max_drop: float | None = None,
     nms: bool = False,
@@ -130,7 +129,7 @@ def export(
     mask_scale: int = 1,
     bgr: bool = False,
     layout: str = "auto",
-    frames: Path | None = None,
+    frames: StrPath | None = None,
     overwrite: bool = False,
 ) -> Exported:
     """Export a model to another runtime; preprocessing, anchors, classes and thresholds travel inside.
@@ -168,6 +167,7 @@ def export(
         OutputError: If a file of the artefact exists (told before the work begins), or cannot be written.
         BackendError: If the comparison fails.
     """
+    output, calibration, frames = map(optional_path, (output, calibration, frames))
     portable = portable or format in ("ncnn", "tensorrt")
     parsed = _parse_size(size)
     _check_options(

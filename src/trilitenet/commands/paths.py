@@ -1,41 +1,36 @@
-"""Paths of commands: text stands for one, and one for several, in the Python API; whether one can be written."""
+"""Paths of commands: texts in their place, and one for several, in the Python API; whether one can be written."""
 
 from __future__ import annotations
 
 import functools
 import inspect
 import os
-import re
 from collections.abc import Callable
 from pathlib import Path, PurePath
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 
 from trilitenet.errors import OutputError, writing
 
-__all__ = ["check_writable", "text_paths"]
+__all__ = ["StrPath", "check_writable", "one_for_several", "optional_path"]
+
+if TYPE_CHECKING:
+    StrPath: TypeAlias = str | Path
+else:
+    StrPath = Path  # what the command line makes of words, and calls them in its help
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-def text_paths(function: _Function) -> _Function:
-    """Return the function so that arguments annotated as paths, and not as texts too, may be texts.
+def one_for_several(function: _Function) -> _Function:
+    """Return the function so that one text or path may be given as it is where several are taken.
 
-    Where several texts or paths are taken, one may be given as it is: its letters are not taken for several.
+    Its letters are not taken for several.
 
     Args:
         function: Of a module with postponed annotations.
     """
     signature = inspect.signature(function)
-    names = {
-        name
-        for name, parameter in signature.parameters.items()
-        if "Path" in str(parameter.annotation) and "str" not in str(parameter.annotation)
-    }
-    several = {
-        name
-        for name, parameter in signature.parameters.items()
-        if re.search(r"Sequence\[|tuple\[\w+, \.\.\.\]", str(parameter.annotation))
-    }
+    several = {name for name, parameter in signature.parameters.items() if "Sequence[" in str(parameter.annotation)}
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -43,17 +38,14 @@ def text_paths(function: _Function) -> _Function:
         for name in several & bound.arguments.keys():
             if isinstance(bound.arguments[name], (str, PurePath)):
                 bound.arguments[name] = (bound.arguments[name],)
-        for name in names & bound.arguments.keys():
-            bound.arguments[name] = _as_path(bound.arguments[name])
         return function(*bound.args, **bound.kwargs)
 
     return cast(_Function, call)
 
 
-def _as_path(value: Any) -> Any:
-    if isinstance(value, str):
-        return Path(value)
-    return [_as_path(one) for one in value] if isinstance(value, (list, tuple)) else value
+def optional_path(path: StrPath | None) -> Path | None:
+    """Return the path that a text says, if there is one."""
+    return None if path is None else Path(path)
 
 
 def check_writable(path: Path) -> None:

@@ -20,7 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.text import Text
 
 from trilitenet.commands.load import load
-from trilitenet.commands.paths import text_paths
+from trilitenet.commands.paths import StrPath, one_for_several
 from trilitenet.commands.progress import show_bars
 from trilitenet.errors import (
     LONGEST_NAME,
@@ -67,7 +67,7 @@ class RoadOptions:
     """
 
     measure: bool = False
-    camera: Path | None = None
+    camera: StrPath | None = None
     track: bool = False
     smoothing: float = 0.0
 
@@ -141,17 +141,17 @@ class PredictReport:
         return f"{'interrupted: ' if self.interrupted else ''}{what}{skipped}{failed}"
 
 
-@text_paths
+@one_for_several
 def predict(
     *sources: str,
-    output: Path = Path("predictions"),
+    output: StrPath = Path("predictions"),
     model: str = "tiny",
     device: str = "auto",
     backend: str = "auto",
     confidence: float | None = None,
-    format: tuple[str, ...] = ("json",),
+    format: Sequence[str] = ("json",),
     overlay: bool = True,
-    hide: tuple[str, ...] = (),
+    hide: Sequence[str] = (),
     overwrite: bool = False,
     skip_existing: bool = False,
     every: int = 1,
@@ -164,7 +164,7 @@ def predict(
     preview: bool = False,
     quiet: bool = False,
     road: bool = False,
-    camera: Path | None = None,
+    camera: StrPath | None = None,
     track: bool = False,
     smoothing: float = 0.0,
 ) -> PredictReport:
@@ -238,11 +238,11 @@ def predict(
         return job.run(predictor, quiet=quiet)
 
 
-@text_paths
+@one_for_several
 def predict_with(
     predictor: Predictor,
     sources: Sequence[str | Path],
-    output: Path,
+    output: StrPath,
     *,
     clip: Clip | None = None,
     format: Sequence[str] = ("json",),
@@ -281,7 +281,7 @@ class _Job:
     def __init__(
         self,
         sources: Sequence[str | Path],
-        output: Path,
+        output: StrPath,
         clip: Clip,
         formats: Sequence[str],
         *,
@@ -298,7 +298,7 @@ class _Job:
             raise ConfigError("--skip-existing and --overwrite exclude each other; choose one")
         if not sources:
             raise InputError("no source was given: name a picture, a folder, a video, a URL or a camera's number")
-        self.output = output
+        self.output = Path(output)
         self.overlay = overlay
         self.hide = hide
         self.preview = preview

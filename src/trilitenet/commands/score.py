@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from trilitenet.commands.evaluate import check_counts, check_output, hash_dataset, write_report
-from trilitenet.commands.paths import text_paths
+from trilitenet.commands.paths import StrPath, one_for_several, optional_path
 from trilitenet.commands.progress import show_progress
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.evaluate import score_predictions
@@ -20,17 +20,17 @@ from trilitenet.errors import ConfigError, DataError
 __all__ = ["score"]
 
 
-@text_paths
+@one_for_several
 def score(
-    predictions: Path,
+    predictions: StrPath,
     /,
     *,
-    data: Path,
+    data: StrPath,
     split: str = "val",
     classes: Sequence[str] = ("vehicle",),
     protocol: Literal["fair", "paper", "both"] = "fair",
     confidence: float = 0.25,
-    output: Path | None = None,
+    output: StrPath | None = None,
     overwrite: bool = False,
     limit: int | None = None,
     resamples: int = 1000,
@@ -63,6 +63,7 @@ def score(
         DataError: If predictions are for none of the images, or one is broken.
         OutputError: If there is a report already.
     """
+    predictions, data, output = Path(predictions), Path(data), optional_path(output)
     check_counts(resamples, worst, limit, paper_batch)
     if not 0 <= confidence <= 1:
         raise ConfigError(f"--confidence must be in [0, 1], got {confidence}")

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from trilitenet.commands.paths import text_paths
+from trilitenet.commands.paths import StrPath
 from trilitenet.commands.progress import show_progress
 from trilitenet.data.synthetic_files import write_dataset
 
@@ -32,9 +32,8 @@ class Synthesized:
         return f"{self.count} scenes in {self.output} (split {self.split})"
 
 
-@text_paths
 def synthesize(
-    output: Path,
+    output: StrPath,
     *,
     count: int = 100,
     seed: int = 0,
@@ -62,4 +61,4 @@ def synthesize(
     """
     with show_progress("scenes") as shown:
         write_dataset(output, split, count, seed, size=size, labels=labels, workers=workers, progress=shown)
-    return Synthesized(output, split, count)
+    return Synthesized(Path(output), split, count)

@@ -30,7 +30,7 @@ from rich.progress import (
 )
 from rich.table import Column
 
-from trilitenet.commands.paths import text_paths
+from trilitenet.commands.paths import StrPath, optional_path
 from trilitenet.commands.progress import show_bars
 from trilitenet.config import DEFAULT_ANCHORS, ModelCard, parse_yaml
 from trilitenet.data.contact_sheet import as_perception
@@ -65,9 +65,8 @@ _YAML_FLAGS: Final = ("anchors", "sampling", "extra_data")
 """Fields whose flag takes YAML, for example --sampling '{timeofday: {night: 2}}'."""
 
 
-@text_paths
 def train(
-    recipe: Path | None = None, /, *, resume: bool = False, overwrite: bool = False, **fields: Any
+    recipe: StrPath | None = None, /, *, resume: bool = False, overwrite: bool = False, **fields: Any
 ) -> TrainResult:
     """Train a network by a recipe; every key of the recipe is also a flag.
 
@@ -80,6 +79,7 @@ def train(
     Returns:
         The run's folder, weights and figures.
     """
+    recipe = optional_path(recipe)
     config = read_recipe(recipe, _nested(fields))
     if not config.data:
         raise ConfigError("no data: give the root folder of a data set with --data")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from trilitenet.commands.evaluate import evaluate, hash_dataset, known_report
-from trilitenet.commands.paths import text_paths
+from trilitenet.commands.paths import StrPath
 from trilitenet.commands.tables import PAPER_COLUMNS, markdown_row
 from trilitenet.commands.train import train, training_data
 from trilitenet.config import parse_yaml, read_yaml
@@ -92,8 +92,9 @@ class TableResult:
         return "\n".join(lines)
 
 
-@text_paths
-def train_table(table: Path, /, *, data: Path, output: Path, resume: bool = False, settings: str = "") -> TableResult:
+def train_table(
+    table: StrPath, /, *, data: StrPath, output: StrPath, resume: bool = False, settings: str = ""
+) -> TableResult:
     """Train every row of a table of the paper, measure it under the published protocol, and print the table.
 
     Rows that are done are not trained again. A row's report is in its folder, under evaluation.
@@ -111,22 +112,22 @@ def train_table(table: Path, /, *, data: Path, output: Path, resume: bool = Fals
     Raises:
         OutputError: If a row that is done was trained with other settings or on other data.
     """
-    title, recipes = _read(table)
+    title, recipes = _read(Path(table))
     more = parse_yaml(settings, "settings") if settings else {}
     if not isinstance(more, dict) or {"data", "output"} & more.keys() or None in more.values():
         raise ConfigError(
             f"settings must be YAML such as '{{epochs: 10}}', without data and output, and no null, got {settings!r}"
         )
-    fields: dict[str, Any] = {str(name): value for name, value in more.items()} | {"data": str(data)}
+    fields: dict[str, Any] = {str(name): value for name, value in more.items()} | {"data": str(Path(data))}
     configs = {name: read_recipe(recipe, fields) for name, recipe in recipes.items()}
     for name, recipe in recipes.items():
-        folder = output / recipe.stem
+        folder = Path(output, recipe.stem)
         if (folder / _WEIGHTS).is_file():
             _check_done(folder, configs[name])
     rows: list[TableRow] = []
     first = True
     for name, recipe in recipes.items():
-        folder = output / recipe.stem
+        folder = Path(output, recipe.stem)
         weights = folder / _WEIGHTS
         finished = weights.is_file()
         if not finished:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from trilitenet.commands.evaluate import check_counts
 from trilitenet.commands.load import load
-from trilitenet.commands.paths import check_writable, text_paths
+from trilitenet.commands.paths import StrPath, check_writable, one_for_several
 from trilitenet.commands.progress import show_progress
 from trilitenet.config import STRIDES, ModelCard, check_size, parse, read_yaml
 from trilitenet.data.reading import DrivingDataset
@@ -39,9 +39,8 @@ class CardText:
     notes: tuple[str, ...] = ()
 
 
-@text_paths
 def import_weights(
-    source: Path, destination: Path, /, *, variant: str | None = None, overwrite: bool = False
+    source: StrPath, destination: StrPath, /, *, variant: str | None = None, overwrite: bool = False
 ) -> ModelCard:
     """Convert a published checkpoint (.pth) to safetensors, strictly and without running code in it.
 
@@ -54,6 +53,7 @@ def import_weights(
     Returns:
         The card written into the file.
     """
+    source, destination = Path(source), Path(destination)
     if destination.exists() and not overwrite:
         raise OutputError(f"{destination}: exists already; give another name or --overwrite")
     card = import_published(source, destination, variant)
@@ -61,15 +61,15 @@ def import_weights(
     return card
 
 
-@text_paths
+@one_for_several
 def finish(
     source: str,
-    destination: Path,
+    destination: StrPath,
     /,
     *,
-    data: Path,
+    data: StrPath,
     split: str = "val",
-    card: Sequence[Path] = (),
+    card: Sequence[StrPath] = (),
     input_size: tuple[int, int] | None = None,
     iou: float | None = None,
     batch_size: int = 8,
@@ -100,6 +100,7 @@ def finish(
         ConfigError: If the input size is not of multiples of 32, or the batch size below 1.
         OutputError: If the destination exists already, or cannot be written.
     """
+    destination, data = Path(destination), Path(data)
     if destination.suffix != ".safetensors":
         raise ConfigError(f"{destination}: weights end with .safetensors")
     if destination.exists() and not overwrite:
