@@ -58,7 +58,7 @@ def test_the_token_comes_from_a_file_or_the_environment(
 ) -> None:
     file = tmp_path / "token"
     file.write_text(f"{TOKEN}\n")
-    command.serve(port=0, token_file=file)
+    command.serve(port=0, token_file=str(file))
     monkeypatch.setenv("TRILITENET_TOKEN", f"{TOKEN[::-1]}\n")
     command.serve(port=0)
     assert [_settings(server).token for server in started] == [TOKEN, TOKEN[::-1]]

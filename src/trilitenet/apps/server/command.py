@@ -10,6 +10,7 @@ import socket
 import sys
 from pathlib import Path
 
+from trilitenet.commands.paths import StrPath
 from trilitenet.errors import ConfigError, InputError, import_extra
 
 __all__ = ["serve"]
@@ -24,7 +25,7 @@ def serve(
     backend: str = "auto",
     confidence: float | None = None,
     streams: int = 1,
-    token_file: Path | None = None,
+    token_file: StrPath | None = None,
     queue: int = 64,
     max_batch: int = 0,
     batch_delay: float = 0.0,
@@ -141,12 +142,12 @@ def _cannot_listen(host: str, port: int, error: OSError) -> ConfigError:
     return ConfigError(f"cannot listen on {host} port {port} ({reason}); choose with --host and --port")
 
 
-def _read_token(file: Path | None) -> str | None:
+def _read_token(file: StrPath | None) -> str | None:
     """Return the bearer token. It is not taken from the command line, where other users could read it."""
     if file is None:
         return os.environ.get("TRILITENET_TOKEN", "").strip() or None
     try:
-        return file.read_text(encoding="utf-8").strip()
+        return Path(file).read_text(encoding="utf-8").strip()
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror or error})") from error
     except UnicodeDecodeError as error:
