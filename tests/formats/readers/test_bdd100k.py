@@ -136,6 +136,12 @@ def test_label_files_of_other_names_are_told(tmp_path: Path) -> None:
     source = read_bdd100k(tmp_path)
     assert source.record("train", "a1").objects is None
     assert source.found[-1].endswith("no images): labels/det_20/det_v2_train_release.json")
+    newer = tmp_path / "labels/det_21/det_val.json"
+    newer.parent.mkdir()
+    shutil.copy(tmp_path / "labels/det_20/det_val.json", newer)
+    found = read_bdd100k(tmp_path).found[-1]
+    assert found.startswith("not read (another of that name is, ")
+    assert found.endswith("): labels/det_20/det_v2_train_release.json, labels/det_20/det_val.json")
 
 
 def test_errors_name_the_file(tmp_path: Path) -> None:

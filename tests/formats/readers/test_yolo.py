@@ -137,7 +137,11 @@ def test_label_files_of_no_image_are_told(root: Path) -> None:
         (root / f"labels/train/{name}.txt").write_text("")
     assert read_yolo(root).found == ("train: 1 images", "val: 1 images")
     (root / "labels/train/a-2.txt").write_text("")
-    assert read_yolo(root).found[-1] == f"1 label files are of no image, such as {root / 'labels/train/a-2.txt'}"
+    (root / "images/train/a-2.jpg").symlink_to("a.jpg")
+    (root / "train.txt").write_text("images/train/a.jpg\n")
+    (root / "data.yaml").write_text("train: train.txt\nval: images/val\nnames: [car]\n")
+    found = read_yolo(root).found[-1]
+    assert found == f"1 label files are of no image in a split, such as {root / 'labels/train/a-2.txt'}"
 
 
 def test_images_of_one_name_and_folder_are_refused(root: Path) -> None:

@@ -190,7 +190,8 @@ def read_bdd100k(raw: str | Path, *, crosswalk: bool = False, vertical: bool = F
     others = [str(path.relative_to(root)) for path in sorted(files) if not read & {path, path.parent}]
     if others:
         rest = f" and {len(others) - 3} more" if len(others) > 3 else ""
-        found.append(f"not read (no label file has that name, or its split no images): {', '.join(others[:3])}{rest}")
+        why = "another of that name is, no label file has it, or its split no images"
+        found.append(f"not read ({why}): {', '.join(others[:3])}{rest}")
     return BddSource(root, splits, tuple(found), crosswalk=crosswalk, vertical=vertical)
 
 

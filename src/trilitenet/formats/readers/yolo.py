@@ -159,7 +159,7 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
     folders = {path.parent for path, image in labels.items() if path.parent != image.parent}
     stray = {path for folder in folders for path in folder.glob("*.txt") if path.name != "classes.txt"} - labels.keys()
     if stray:
-        found.append(f"{len(stray)} label files are of no image, such as {min(stray)}")
+        found.append(f"{len(stray)} label files are of no image in a split, such as {min(stray)}")
     return YoloSource(path, dict(images), table, mapping, tuple(found))
 
 
