@@ -171,6 +171,5 @@ class Perception:
             ShapeError: If there is no image, or one of another size.
         """
         from trilitenet.processing.drawing import draw
-        from trilitenet.processing.images import read_image
 
-        return draw(self, None if image is None else read_image(image))
+        return draw(self, image)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 import cv2
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from trilitenet.errors import ConfigError, ShapeError, did_you_mean
+from trilitenet.processing.images import read_image
 from trilitenet.structures import Boxes, Perception
 
 __all__ = [
@@ -66,7 +68,7 @@ def check_parts(hide: Collection[str], known: Collection[str] = PARTS) -> frozen
 
 def draw(
     perception: Perception,
-    image: NDArray[np.uint8] | None = None,
+    image: str | Path | bytes | Image.Image | NDArray[Any] | None = None,
     *,
     hide: Collection[str] = (),
     out: NDArray[np.uint8] | None = None,
@@ -75,7 +77,7 @@ def draw(
 
     Args:
         perception: What to draw.
-        image: (height, width, 3) uint8 RGB to draw on; the perception's own if left out.
+        image: What to draw on, in any form that `read_image` takes; the perception's own if left out.
         hide: Parts to leave out, of `PARTS`.
         out: Where to draw; may be ``image`` itself. Made if left out.
 
@@ -83,6 +85,7 @@ def draw(
         (height, width, 3) uint8 RGB, ``out`` if it was given.
 
     Raises:
+        InputError: If an image cannot be read.
         ShapeError: If there is no image, or one of another size.
         ConfigError: If a part is unknown.
     """
@@ -90,9 +93,10 @@ def draw(
     image = perception.image if image is None else image
     if image is None:
         raise ShapeError("this perception did not keep its image; pass one: perception.draw(image)")
-    if image.shape != (*perception.size, 3) or image.dtype != np.uint8:
-        raise ShapeError(f"the image must be {(*perception.size, 3)} uint8, got {image.shape} {image.dtype}")
-    canvas = np.empty_like(image, order="C") if out is None else out
+    image = read_image(image)
+    if image.shape != (*perception.size, 3):
+        raise ShapeError(f"the image must be {(*perception.size, 3)}, got {image.shape}")
+    canvas = np.empty_like(image) if out is None else out
     if canvas is not image:
         np.copyto(canvas, image)
     layers = {
