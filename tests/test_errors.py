@@ -15,6 +15,7 @@ from trilitenet.errors import (
     MissingExtraError,
     OutputError,
     did_you_mean,
+    few,
     import_extra,
     needing_torch,
     part_of,
@@ -125,6 +126,11 @@ def test_a_link_to_nowhere_is_followed(tmp_path: Path) -> None:
 def test_what_is_told_already_is_not_told_again(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"^a: is full$"), writing(tmp_path / "b"):
         raise OutputError("a: is full")
+
+
+def test_of_many_names_the_first_are_told() -> None:
+    assert [few(list(names)) for names in ("", "abc", "abcde")] == ["", "a, b, c", "a, b, c and 2 more"]
+    assert few(list("abcde"), most=5) == "a, b, c, d, e"
 
 
 def test_dashes_make_no_two_options_alike() -> None:

@@ -26,7 +26,7 @@ import stat
 import sys
 import tempfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Final
@@ -46,6 +46,7 @@ __all__ = [
     "WeightsError",
     "brief",
     "did_you_mean",
+    "few",
     "folder_beside",
     "import_extra",
     "part_of",
@@ -118,6 +119,11 @@ def shown(value: object) -> str:
     except ValueError:  # a whole number that Python does not write
         return "a number of thousands of digits"
     return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]} ..."
+
+
+def few(names: Sequence[str], most: int = 3) -> str:
+    """Return the first names for a message, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

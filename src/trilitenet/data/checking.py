@@ -14,7 +14,7 @@ import itertools
 import math
 import mmap
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -34,7 +34,7 @@ from trilitenet.data.reading import (
     label_file,
     read_index,
 )
-from trilitenet.errors import DataError, import_extra
+from trilitenet.errors import DataError, few, import_extra
 from trilitenet.processing.boxes import best_side_ratio
 from trilitenet.processing.cores import ProcessPool
 from trilitenet.processing.images import BROKEN, upright_size
@@ -606,8 +606,7 @@ def _sorted(counts: Counter[str]) -> dict[str, int]:
 
 
 def _listed(values: Iterable[int] | Iterable[str]) -> str:
-    ordered: Sequence[int | str] = sorted(values)
-    return ", ".join(map(str, ordered[:8])) + (", ..." if len(ordered) > 8 else "")
+    return few([str(value) for value in sorted(values)], most=8)
 
 
 def _reason(error: BaseException) -> str:

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from trilitenet.config import Task, parse_json
 from trilitenet.data.description import DatasetDescription, MaskMeaning, class_table, read_description
 from trilitenet.data.sample import Sample
-from trilitenet.errors import DataError, brief, did_you_mean
+from trilitenet.errors import DataError, brief, did_you_mean, few
 
 __all__ = [
     "FOLDERS",
@@ -326,7 +326,7 @@ class DrivingDataset:
                 "which categories make up a class",
                 self.root,
                 ", ".join(without),
-                ", ".join(foreign[:10]) + (" and others" if len(foreign) > 10 else ""),
+                few(foreign, most=10),
             )
 
     def __getitem__(self, index: int) -> Sample:

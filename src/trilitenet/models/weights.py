@@ -31,7 +31,7 @@ from trilitenet.config import (
     get_variant,
     shipped_weights,
 )
-from trilitenet.errors import ConfigError, OutputError, WeightsError, replacing
+from trilitenet.errors import ConfigError, OutputError, WeightsError, few, replacing
 from trilitenet.models.trilitenet import TriLiteNet, build_network, foreign_layers
 
 __all__ = [
@@ -314,20 +314,14 @@ def _load_strictly(network: TriLiteNet, tensors: Mapping[str, Tensor], source: s
     surplus = [key for key in tensors if key not in own]
     if missing or surplus:
         hint = " (it is not a TriLiteNet checkpoint)" if published and len(missing) > len(own) // 2 else ""
-        raise WeightsError(f"{source}: {_list('missing', missing)}{_list('surplus', surplus)}{hint}".rstrip("; "))
+        wrong = [f"{what} {few(keys)}" for what, keys in (("missing", missing), ("surplus", surplus)) if keys]
+        raise WeightsError(f"{source}: {'; '.join(wrong)}{hint}")
     for key, tensor in tensors.items():
         if tensor.shape != own[key].shape:
             raise WeightsError(f"{source}: {key} is {tuple(tensor.shape)}, must be {tuple(own[key].shape)}")
         if not torch.isfinite(tensor.to(own[key].dtype)).all():  # as it is loaded: of 8-bit floats it cannot be told
             raise WeightsError(f"{source}: {key} holds values that are not finite; the file is damaged")
     network.load_state_dict({key: tensors.get(key, own[key]).to(own[key].dtype) for key in own})
-
-
-def _list(what: str, keys: list[str]) -> str:
-    if not keys:
-        return ""
-    more = f" and {len(keys) - 3} more" if len(keys) > 3 else ""
-    return f"{what} {', '.join(keys[:3])}{more}; "
 
 
 def _load_pickle(path: Path) -> Any:

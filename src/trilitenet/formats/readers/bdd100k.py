@@ -28,7 +28,7 @@ from trilitenet.config import TASKS, Task, parse_json
 from trilitenet.data.rasterise import flatten
 from trilitenet.data.reading import IMAGE_ENDINGS, is_crowd
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel, same_name
-from trilitenet.errors import DataError, brief
+from trilitenet.errors import DataError, brief, few
 from trilitenet.formats.readers.mapping import Labels
 
 __all__ = ["BDD100K_SPLITS", "BddSource", "parse_labels", "read_bdd100k"]
@@ -189,9 +189,8 @@ def read_bdd100k(raw: str | Path, *, crosswalk: bool = False, vertical: bool = F
         )
     others = [str(path.relative_to(root)) for path in sorted(files) if not read & {path, path.parent}]
     if others:
-        rest = f" and {len(others) - 3} more" if len(others) > 3 else ""
         why = "another of that name is, no label file has it, or its split no images"
-        found.append(f"not read ({why}): {', '.join(others[:3])}{rest}")
+        found.append(f"not read ({why}): {few(others)}")
     return BddSource(root, splits, tuple(found), crosswalk=crosswalk, vertical=vertical)
 
 

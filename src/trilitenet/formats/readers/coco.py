@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,12 +25,10 @@ from trilitenet.data.records import (
     ObjectLabel,
     named_apart,
 )
-from trilitenet.errors import DataError, brief
+from trilitenet.errors import DataError, brief, few
 from trilitenet.formats.readers.mapping import SPLIT_NAMES, LabelMapping, Labels, find_image, read_json
 
 __all__ = ["read_coco"]
-
-_MOST_NAMED: Final = 10
 
 
 def read_coco(root: str | Path, mapping: LabelMapping | None = None) -> ListedRecords:
@@ -63,8 +61,7 @@ def read_coco(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
         raise DataError(f"{root}: none of the images of its annotation files is there")
     mapping.check_categories(categories, root)
     if unused:
-        more = f" and {len(unused) - _MOST_NAMED} more" * (len(unused) > _MOST_NAMED)
-        found.append(f"not used: {', '.join(path.name for path in unused[:_MOST_NAMED])}{more}")
+        found.append(f"not used: {few([path.name for path in unused], most=10)}")
     splits = {split: named_apart(items) for split, items in records.items() if items}
     return ListedRecords(splits, tuple(found), mapping.origin("coco", root))
 
