@@ -314,6 +314,11 @@ def test_a_condition_that_an_image_lacks_is_undefined(root: Path) -> None:
         "rain": {"train": 15, "val": 5},
         "undefined": {"train": 15, "val": 5},
     }
+    index.unlink()
+    write_annotation(root, "train", "train_0000", [], weather="rain", speed="30")
+    conditions = check_dataset(root).conditions
+    assert conditions["weather"] == {"rain": {"train": 1}, "undefined": {"train": 29, "val": 10}}
+    assert "speed" not in conditions  # numbers
 
 
 def test_labels_of_tasks_that_are_not_labelled_at_all_do_not_count(root: Path) -> None:

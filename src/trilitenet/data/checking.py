@@ -572,19 +572,22 @@ def _find_sequences(index: list[dict[str, str]], facts: dict[str, list[_Facts]],
 def _conditions(facts: dict[str, list[_Facts]], index: list[dict[str, str]]) -> dict[str, dict[str, dict[str, int]]]:
     """Return attribute -> value -> split -> images, for attributes with few values."""
     rows = {(row.get("split", ""), row.get("name", "")): row for row in index}
+    described = [
+        (split, {**fact.attributes, **rows.get((split, fact.name), {})})
+        for split, items in facts.items()
+        for fact in items
+    ]
     table: dict[str, dict[str, Counter[str]]] = defaultdict(lambda: defaultdict(Counter))
-    for split, items in facts.items():
-        for fact in items:
-            row = rows.get((split, fact.name), {})
-            for key, value in {**fact.attributes, **row}.items():
-                if key not in {"name", "split"}:
-                    table[key][value or "undefined"][split] += 1  # as the evaluation calls it
+    for key in {key for _, attributes in described for key in attributes} - {"name", "split"}:
+        for split, attributes in described:
+            table[key][attributes.get(key) or "undefined"][split] += 1  # as the evaluation calls it
     total = sum(map(len, facts.values()))
     limit = max(2, min(40, total // 3))
     return {
         key: {value: dict(sorted(counts.items())) for value, counts in sorted(values.items())}
         for key, values in sorted(table.items())
-        if 1 <= len(values) <= limit and not all(value.replace(".", "", 1).isdigit() for value in values)
+        if 1 <= len(values) <= limit
+        and not all(value.replace(".", "", 1).isdigit() for value in values.keys() - {"undefined"})
     }
 
 
