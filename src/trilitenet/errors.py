@@ -147,7 +147,7 @@ def import_extra(module: str, extra: str) -> ModuleType:
         MissingExtraError: If it is not installed; the message names the extra.
     """
     try:
-        with _unreported():
+        with _unreported() if module in {"openvino", "nncf"} else contextlib.nullcontext():
             return importlib.import_module(module)
     except ImportError as error:
         if isinstance(error.__cause__, KeyboardInterrupt):  # pybind11's modules make an ImportError of it
