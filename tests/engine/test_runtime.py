@@ -11,9 +11,12 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -165,6 +168,34 @@ def test_the_first_wish_to_stop_is_noted_and_a_second_ctrl_c_is_one() -> None:
     finally:
         for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
+
+
+def test_a_signal_that_is_put_off_keeps_nothing_of_what_it_came_upon(monkeypatch: pytest.MonkeyPatch) -> None:
+    heard: list[int] = []
+
+    def hear(number: int, frame: FrameType | None) -> None:
+        heard.append(number)
+
+    def step() -> weakref.ref[Any]:
+        taken = np.zeros(1)
+        signal.raise_signal(signal.SIGCHLD)
+        return weakref.ref(taken)
+
+    before = signal.signal(signal.SIGCHLD, hear)
+    try:
+        with runtime.putting_off("SIGCHLD") as heeding:
+            kept = [step(), step()]
+            assert not heard
+            assert [one() for one in kept] == [None, None]
+            with heeding():
+                assert heard == [signal.SIGCHLD]
+                signal.raise_signal(signal.SIGCHLD)
+                assert len(heard) == 2
+            with heeding():
+                assert len(heard) == 2  # each is told once
+        assert signal.getsignal(signal.SIGCHLD) is hear
+    finally:
+        signal.signal(signal.SIGCHLD, before)
 
 
 def test_a_port_that_is_taken_is_named(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -314,20 +314,22 @@ def putting_off(name: str) -> Iterator[Callable[[], contextlib.AbstractContextMa
     if number is None or threading.current_thread() is not threading.main_thread():
         yield contextlib.nullcontext
         return
-    came: list[tuple[int, FrameType | None]] = []
+    came = False
 
-    def note(*news: Any) -> None:
-        came.append(news)
+    def note(number: int, frame: FrameType | None) -> None:
+        nonlocal came
+        came = True  # alone: the frame would keep the memory of a training step
 
     handler = signal.signal(number, note)
 
     @contextlib.contextmanager
     def heeding() -> Iterator[None]:
-        nonlocal handler
+        nonlocal handler, came
         signal.signal(number, handler)
         try:
             if came and callable(handler):
-                handler(*came.pop())
+                came = False
+                handler(number, None)
             yield
         finally:
             handler = signal.signal(number, note)  # which may be another by now
