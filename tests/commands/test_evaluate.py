@@ -44,13 +44,14 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(data: Path, weights: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Report, Path]:
     folder = tmp_path_factory.mktemp("run")
     report = evaluate(
-        str(weights), data=data, protocol="both", output=folder, save=folder / "predictions", resamples=20, worst=1
+        weights, data=data, protocol="both", output=folder, save=folder / "predictions", resamples=20, worst=1
     )
     return report, folder
 
 
 def test_evaluating_writes_the_report_and_the_predictions(run: tuple[Report, Path], weights: Path) -> None:
     report, folder = run
+    assert report.provenance.model == str(weights)
     assert report.provenance.images == 4
     assert report.provenance.canvas == ("160x96",)
     assert report.provenance.model_sha256 == hashlib.sha256(weights.read_bytes()).hexdigest()

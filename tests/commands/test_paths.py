@@ -1,4 +1,4 @@
-"""Texts in place of paths, in every command of the Python API."""
+"""Texts in place of paths, and paths in place of names, in every command of the Python API."""
 
 from __future__ import annotations
 
@@ -56,6 +56,10 @@ def test_one_text_stands_for_several() -> None:
         lambda: show("nowhere", "x.html", where="weather=rainy"),
         lambda: synthesize("x", size=(1, 1)),
         lambda: train_table("nowhere.yaml", data="nowhere", output="x"),
+        lambda: trilitenet.benchmark(Path("nowhere.onnx")),
+        lambda: trilitenet.export(Path("nowhere.safetensors")),
+        lambda: evaluate(Path("nowhere.onnx"), data="nowhere"),
+        lambda: predict(Path("nowhere.jpg"), model=Path("nowhere.onnx")),
     ],
 )
 def test_every_command_takes_texts(

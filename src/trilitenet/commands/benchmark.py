@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 import trilitenet
 from trilitenet.commands.load import check_parallel, load
-from trilitenet.commands.paths import StrPath, check_writable, one_for_several, optional_path
+from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, one_for_several, optional_path
 from trilitenet.config import VARIANTS, check_size
 from trilitenet.engine.provenance import peak_memory
 from trilitenet.errors import ConfigError, import_extra, write_file
@@ -137,7 +137,7 @@ class Benchmark:
 
 @one_for_several
 def benchmark(
-    *models: str,
+    *models: NameOrPath,
     backend: Sequence[str] = ("auto",),
     batch: Sequence[int] = (1,),
     stage: Literal["network", "frame"] = "network",
@@ -204,7 +204,7 @@ def benchmark(
         if table == "cost":
             result = Benchmark((), _costs(size), machine, 0, None)
         else:
-            for name, one in itertools.product(models or ("tiny",), backend):
+            for name, one in itertools.product(map(str, models or ("tiny",)), backend):
                 entry = _Entry(name, one, device, streams, threads)
                 stack.enter_context(entry.predictor)
                 calls += [_Call(entry, count, stage, size, source) for count in batch]

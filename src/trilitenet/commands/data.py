@@ -16,7 +16,7 @@ from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 
-from trilitenet.commands.paths import StrPath, one_for_several, optional_path
+from trilitenet.commands.paths import NameOrPath, StrPath, one_for_several, optional_path
 from trilitenet.commands.progress import show_progress
 from trilitenet.data.check_page import check_page, picture_page
 from trilitenet.data.checking import KINDS, CheckReport, check_dataset, detect_layout
@@ -88,7 +88,7 @@ class Converted:
 
 @one_for_several
 def convert(
-    source: str,
+    source: NameOrPath,
     output: StrPath,
     target: StrPath | None = None,
     /,
@@ -134,7 +134,7 @@ def convert(
         DataError: If the source cannot be read.
         OutputError: If the output holds something else.
     """
-    chosen, raw, out = _arguments(source, output, target, kind)
+    chosen, raw, out = _arguments(str(source), output, target, kind)
     mapping = read_mapping(classes)
     options = ConversionOptions(
         classes=mapping.classes,

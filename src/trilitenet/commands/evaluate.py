@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from trilitenet.commands.load import load
-from trilitenet.commands.paths import StrPath, check_writable, one_for_several, optional_path
+from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, one_for_several, optional_path
 from trilitenet.commands.progress import show_progress
 from trilitenet.config import ArtefactInfo, Task, shipped_weights
 from trilitenet.data.reading import DrivingDataset
@@ -30,7 +30,7 @@ __all__ = ["evaluate", "hash_dataset", "hash_model", "write_report"]
 
 @one_for_several
 def evaluate(
-    model: str = "tiny",
+    model: NameOrPath = "tiny",
     /,
     *,
     data: StrPath,
@@ -91,7 +91,7 @@ def evaluate(
             protocol decides.
         OutputError: If there is a report already.
     """
-    data, output, save = Path(data), optional_path(output), optional_path(save)
+    model, data, output, save = str(model), Path(data), optional_path(output), optional_path(save)
     check_counts(resamples, worst, limit, paper_batch, batch_size)
     if not severities or not set(severities) <= set(SEVERITIES):
         raise ConfigError(f"--severities must be of 1 to 5, got {', '.join(map(str, severities)) or 'none'}")

@@ -20,7 +20,7 @@ from trilitenet.commands.export import (
     export,
     find_pictures,
 )
-from trilitenet.commands.paths import StrPath, check_writable, one_for_several
+from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, one_for_several
 from trilitenet.commands.tables import PAPER_COLUMNS, markdown_row
 from trilitenet.config import ARTEFACT_SUFFIXES, VARIANTS
 from trilitenet.data.reading import DrivingDataset
@@ -109,7 +109,7 @@ class PrecisionTable:
 
 @one_for_several
 def evaluate_table(
-    *models: str,
+    *models: NameOrPath,
     data: StrPath,
     output: StrPath,
     precisions: Sequence[Precision] | None = None,
@@ -170,7 +170,7 @@ def evaluate_table(
         int8 += "" if max_drop is None else f"-drop{max_drop:g}"
     rows: list[PrecisionRow] = []
     hashes: dict[tuple[str, ...], dict[str, str]] = {}  # the classes decide what labels mean
-    for model in models or VARIANTS:
+    for model in map(str, models or VARIANTS):
         classes = read_card(model).class_names
         if classes not in hashes:
             hashes[classes] = hash_dataset(DrivingDataset(data, split, class_names=classes), limit)

@@ -18,7 +18,7 @@ from torch.nn.functional import interpolate
 
 import trilitenet
 from trilitenet.commands.load import open_backend
-from trilitenet.commands.paths import StrPath, check_writable, optional_path
+from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, optional_path
 from trilitenet.config import ARTEFACT_KEY, ARTEFACT_SUFFIXES, CARD_KEY, ArtefactInfo, Task, check_size
 from trilitenet.data.reading import IMAGE_ENDINGS, DrivingDataset
 from trilitenet.deploy.graph import DeployGraph, Masks, Traceable
@@ -113,7 +113,7 @@ class Exported:
 
 
 def export(
-    model: str = "tiny",
+    model: NameOrPath = "tiny",
     /,
     *,
     format: Format = "onnx",
@@ -167,7 +167,7 @@ def export(
         OutputError: If a file of the artefact exists (told before the work begins), or cannot be written.
         BackendError: If the comparison fails.
     """
-    output, calibration, frames = map(optional_path, (output, calibration, frames))
+    model, output, calibration, frames = str(model), *map(optional_path, (output, calibration, frames))
     portable = portable or format in ("ncnn", "tensorrt")
     parsed = _parse_size(size)
     _check_options(

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 
 from trilitenet.errors import OutputError, writing
 
-__all__ = ["StrPath", "check_writable", "one_for_several", "optional_path"]
+__all__ = ["NameOrPath", "StrPath", "check_writable", "one_for_several", "optional_path"]
 
 if TYPE_CHECKING:
     StrPath: TypeAlias = str | Path
-else:
-    StrPath = Path  # what the command line makes of words, and calls them in its help
+    NameOrPath: TypeAlias = str | Path
+else:  # what the command line makes of words, and calls them in its help
+    StrPath = Path
+    NameOrPath = str
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 

@@ -20,7 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.text import Text
 
 from trilitenet.commands.load import load
-from trilitenet.commands.paths import StrPath, one_for_several
+from trilitenet.commands.paths import NameOrPath, StrPath, one_for_several
 from trilitenet.commands.progress import show_bars
 from trilitenet.errors import (
     LONGEST_NAME,
@@ -143,9 +143,9 @@ class PredictReport:
 
 @one_for_several
 def predict(
-    *sources: str,
+    *sources: NameOrPath,
     output: StrPath = Path("predictions"),
-    model: str = "tiny",
+    model: NameOrPath = "tiny",
     device: str = "auto",
     backend: str = "auto",
     confidence: float | None = None,

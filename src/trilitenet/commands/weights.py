@@ -10,7 +10,7 @@ from pathlib import Path
 
 from trilitenet.commands.evaluate import check_counts
 from trilitenet.commands.load import load
-from trilitenet.commands.paths import StrPath, check_writable, one_for_several
+from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, one_for_several
 from trilitenet.commands.progress import show_progress
 from trilitenet.config import STRIDES, ModelCard, check_size, parse, read_yaml
 from trilitenet.data.reading import DrivingDataset
@@ -63,7 +63,7 @@ def import_weights(
 
 @one_for_several
 def finish(
-    source: str,
+    source: NameOrPath,
     destination: StrPath,
     /,
     *,
@@ -153,7 +153,7 @@ def _describe(card: ModelCard, texts: Sequence[CardText]) -> ModelCard:
     return card
 
 
-def info(file: str, /, *, json_output: bool = False) -> ModelCard:
+def info(file: NameOrPath, /, *, json_output: bool = False) -> ModelCard:
     """Print the card of a weight file: classes, input size, anchors, training data, metrics, licence.
 
     Args:

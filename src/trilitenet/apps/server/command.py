@@ -10,14 +10,14 @@ import socket
 import sys
 from pathlib import Path
 
-from trilitenet.commands.paths import StrPath
+from trilitenet.commands.paths import NameOrPath, StrPath
 from trilitenet.errors import ConfigError, InputError, import_extra
 
 __all__ = ["serve"]
 
 
 def serve(
-    model: str = "tiny",
+    model: NameOrPath = "tiny",
     *,
     host: str = "127.0.0.1",
     port: int = 8000,
