@@ -97,8 +97,7 @@ def draw(
     if image.shape != (*perception.size, 3):
         raise ShapeError(f"the image must be {(*perception.size, 3)}, got {image.shape}")
     canvas = np.empty_like(image) if out is None else out
-    if canvas is not image:
-        np.copyto(canvas, image)
+    np.copyto(canvas, image)  # nothing to do where both are the same memory
     layers = {
         name: mask
         for name, mask in (("drivable", perception.drivable), ("lane", perception.lane))
