@@ -592,8 +592,8 @@ def _forget(plan: _Plan, splits: Iterable[str]) -> None:
     """Take splits whose shards may be written again out of the state, so that nobody reads a mixture."""
     there = _read_state(plan.out)
     for split in splits:
-        there["splits"].pop(split, None)
-        there["shards"].pop(split, None)
+        for part in ("splits", "shards", "counts"):
+            there[part].pop(split, None)
     _replace_state(plan, there)
 
 
