@@ -14,7 +14,6 @@ import argparse
 import gc
 import json
 import os
-import platform
 import statistics
 import tempfile
 import time
@@ -26,6 +25,7 @@ import numpy as np
 
 import trilitenet
 from trilitenet.commands.predict import RoadOptions, predict_with
+from trilitenet.engine.provenance import describe_hardware
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, VideoReader
 from trilitenet.inference.video import VideoWriter
@@ -187,7 +187,7 @@ def main() -> None:
     for _ in range(options.rounds):
         alone = pure_inference(predictor, batch, options.frames)
         rounds.append((alone, pipeline(predictor, options.video, options.frames, options.overlay, road)))
-    print(f"machine: {platform.processor() or platform.machine()}, {os.cpu_count()} cores; {predictor.backend.name}")
+    print(f"machine: {describe_hardware()}; {predictor.backend.name}")
     for alone, whole in rounds:
         print(f"pure inference {alone:7.1f} frames/s   pipeline {whole:7.1f} frames/s   ratio {whole / alone:.2f}")
     print(f"median ratio {statistics.median(whole / alone for alone, whole in rounds):.2f}")
