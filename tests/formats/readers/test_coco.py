@@ -277,3 +277,18 @@ def test_images_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> N
     source = read_coco(tmp_path, LabelMapping(classes=CLASSES))
     assert source.names("train") == ["monday-one", "tuesday-one"]
     assert [len(source.record("train", name).objects or ()) for name in source.names("train")] == [5, 0]
+
+
+def test_subsets_as_cvat_and_datumaro_export_them(tmp_path: Path) -> None:
+    for subset in ("default", "Rear"):
+        write(tmp_path / "images" / subset / "one.png")
+        write(tmp_path / f"annotations/instances_{subset}.json", coco())
+    source = read_coco(tmp_path)
+    assert source.names("train") == ["Rear-one", "default-one"]
+    assert [source.record("train", name).image.parent.name for name in source.names("train")] == ["Rear", "default"]
+
+
+def test_paths_may_be_of_windows(tmp_path: Path) -> None:
+    write(tmp_path / "JPEGImages/one.png")
+    write(tmp_path / "labels.json", coco(images=[{**coco()["images"][0], "file_name": r"JPEGImages\one.png"}]))
+    assert read_coco(tmp_path).record("train", "one").image == tmp_path / "JPEGImages/one.png"

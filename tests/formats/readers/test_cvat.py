@@ -183,3 +183,21 @@ def test_images_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> N
         lines.append(f'<image name="{folder}/one.png" width="80" height="48"><tag label="road"/></image>')
     (tmp_path / "annotations.xml").write_text(f"<annotations>{''.join(lines)}</annotations>")
     assert read_cvat(tmp_path, LabelMapping(drivable=("road",))).names("train") == ["monday-one", "tuesday-one"]
+
+
+def test_a_project_as_cvat_exports_it(tmp_path: Path) -> None:
+    """Pictures are in a folder a subset, called as in CVAT, and frames of a video are named without their ending."""
+    lines = []
+    for subset, file in (("default", "frame_000000.PNG"), ("Validation", "frame_000000.PNG"), ("Night", "one.jpg")):
+        (tmp_path / "images" / subset).mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / "images" / subset / file), np.zeros((*SIZE, 3), np.uint8))
+        name = file.removesuffix(".PNG")
+        lines.append(f'<image name="{name}" subset="{subset}" width="80" height="48"><tag label="road"/></image>')
+    (tmp_path / "annotations.xml").write_text(f"<annotations>{''.join(lines)}</annotations>")
+    source = read_cvat(tmp_path, LabelMapping(drivable=("road",)))
+    assert {split: source.names(split) for split in source.splits} == {
+        "train": ["frame_000000"],
+        "val": ["frame_000000"],
+        "night": ["one"],
+    }
+    assert source.record("val", "frame_000000").image == tmp_path / "images/Validation/frame_000000.PNG"

@@ -132,6 +132,7 @@ def _read_file(
         folders = [path.parent]
         for root in roots:
             folders += [root, root / "images"]
+            folders.append(root / "images" / path.stem.removeprefix("instances_"))  # of CVAT's and Datumaro's subsets
             for word in dict.fromkeys([_split_of(path, split), split]):  # a single file's name may say where to look
                 folders += [root / word, root / "images" / word]
                 folders += [folder for folder in sorted(root.glob(f"*{word}*")) if folder.is_dir()]

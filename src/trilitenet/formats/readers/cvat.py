@@ -36,6 +36,8 @@ _NEEDED: Final = {
     "polyline": "points must be numbers 'x,y;x,y;...'",
     "mask": "left, top, width, height and rle must be whole numbers",
 }
+_NO_SUBSET: Final = "default"
+"""The subset that an export of a project gives the tasks that have none."""
 _SHAPES = {"box", "polygon", "polyline", "mask", "points", "ellipse", "cuboid", "skeleton", "tag"}
 
 
@@ -107,11 +109,11 @@ def _read_file(
     missing = 0
     for element in images:
         name = element.get("name", "")
-        subset = (element.get("subset") or "").lower()
-        split = SPLIT_NAMES.get(subset, subset or mapping.split)
-        place = find_image(
-            name, [folder, folder / "images", folder / split, folder / "images" / split, folder / "data"]
-        )
+        subset = element.get("subset") or ""
+        own = "" if subset.lower() == _NO_SUBSET else subset.lower()
+        split = SPLIT_NAMES.get(own, own or mapping.split)
+        tops = [folder, folder / "images"]
+        place = find_image(name, [*tops, *(top / part for part in (split, subset) for top in tops), folder / "data"])
         if place is None:
             missing += 1
             continue

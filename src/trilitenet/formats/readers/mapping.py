@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import re
 from collections import Counter
 from collections.abc import Collection
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import Task, check_tasks, parse, parse_json, read_yaml
 from trilitenet.data.description import VEHICLES
+from trilitenet.data.reading import IMAGE_ENDINGS
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ObjectLabel, RunLabel
 from trilitenet.errors import ConfigError, DataError, brief
 
@@ -249,10 +251,17 @@ def hull(points: NDArray[np.float64]) -> tuple[float, float, float, float]:
 
 
 def find_image(name: str, folders: list[Path]) -> Path | None:
-    """Return the first of the folders' files with that name, or with its last part."""
+    """Return the first of the folders' files with that name, or with its last part.
+
+    A name without the ending of an image, as CVAT gives the frames of a video, is that of a file with any of them.
+    """
+    name = name.replace("\\", "/")  # as written on Windows
+    endings = [""]
+    if Path(name).suffix.lower() not in IMAGE_ENDINGS:
+        endings += [*IMAGE_ENDINGS, *map(str.upper, IMAGE_ENDINGS)]
     for candidate in (name, Path(name).name):
-        for folder in folders:
-            path = folder / candidate
+        for folder, ending in itertools.product(folders, endings):
+            path = folder / f"{candidate}{ending}"
             with contextlib.suppress(OSError):  # a name that is too long is none of a file
                 if path.is_file():
                     return path
