@@ -10,6 +10,7 @@ import dataclasses
 import itertools
 import json
 import math
+import operator
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar, get_args, get_type_hints
@@ -39,6 +40,7 @@ __all__ = [
     "Task",
     "Thresholds",
     "VariantConfig",
+    "as_size",
     "check_anchors",
     "check_size",
     "check_tasks",
@@ -337,10 +339,24 @@ def check_size(size: tuple[int, int], name: str = "size") -> None:
     """Refuse a (height, width) of the input that the network cannot take; ``name`` is what messages call it.
 
     Raises:
-        ConfigError: If a side is no positive multiple of `MAX_STRIDE`.
+        ConfigError: If it is no (height, width), or a side is no positive multiple of `MAX_STRIDE`.
     """
-    if min(size) < MAX_STRIDE or any(side % MAX_STRIDE for side in size):
-        raise ConfigError(f"{name} must be multiples of {MAX_STRIDE}, got {size[0]}x{size[1]} (height x width)")
+    height, width = as_size(size, name)
+    if min(height, width) < MAX_STRIDE or height % MAX_STRIDE or width % MAX_STRIDE:
+        raise ConfigError(f"{name} must be multiples of {MAX_STRIDE}, got {height}x{width} (height x width)")
+
+
+def as_size(size: Any, name: str = "size") -> tuple[int, int]:
+    """Return a (height, width), which may be a list or an array, as plain numbers; messages call it ``name``.
+
+    Raises:
+        ConfigError: If it is not two whole numbers.
+    """
+    try:
+        height, width = map(operator.index, size)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{name} must be two whole numbers, (height, width), got {shown(size)}") from error
+    return height, width
 
 
 def check_anchors(anchors: Any) -> Anchors:

@@ -141,6 +141,21 @@ def test_refuses_nonsense() -> None:
         SyntheticDrive(frames=0)
 
 
+@pytest.mark.parametrize("size", ["96x160", 96, (96.5, 160), (96, 160, 3)])
+def test_a_size_is_two_whole_numbers(tmp_path: Path, size: Any) -> None:
+    with pytest.raises(ConfigError, match=r"^size must be two whole numbers, \(height, width\), got "):
+        write_dataset(tmp_path / "out", count=1, size=size)
+    with pytest.raises(ConfigError, match=r"^size must be two whole numbers, \(height, width\), got "):
+        SyntheticDrive(size=size)
+
+
+def test_a_size_may_be_a_list_or_an_array(tmp_path: Path) -> None:
+    size: Any = [96, 160]
+    write_dataset(tmp_path / "out", count=1, size=size)
+    assert DrivingDataset(tmp_path / "out", "train")[0].size == (96, 160)
+    assert SyntheticDrive(frames=1, size=np.array(size))[0].sample.size == (96, 160)  # type: ignore[arg-type]
+
+
 def test_written_scenes_read_back(tmp_path: Path) -> None:
     write_dataset(tmp_path, "train", count=3, seed=9, size=SIZE)
     data = DrivingDataset(tmp_path, "train")

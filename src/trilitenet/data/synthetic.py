@@ -13,6 +13,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from trilitenet.config import as_size
 from trilitenet.data.sample import Sample
 from trilitenet.data.synthetic_chance import random_world
 from trilitenet.data.synthetic_render import FIRST_VEHICLE, Rendering, render
@@ -141,6 +142,7 @@ class SyntheticScenes:
     ) -> None:
         if labels not in ("lines", "paint"):
             raise ConfigError(f"labels must be 'lines' or 'paint', got {labels!r}")
+        size = as_size(size)
         if min(size) < 32:
             raise ConfigError(f"size must be at least 32 pixels each way, got {size}")
         self.seed, self.size, self.length, self.labels, self.faults = seed, size, count, labels, faults

@@ -10,6 +10,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from trilitenet.config import as_size
 from trilitenet.data.synthetic import Scene, label_scene
 from trilitenet.data.synthetic_chance import random_layout, random_light, random_scenery, random_vehicle
 from trilitenet.data.synthetic_render import render
@@ -55,7 +56,7 @@ class SyntheticDrive:
         if frames < 1 or fps <= 0:
             raise ConfigError(f"a drive needs at least one frame and a positive rate, got {frames} and {fps}")
         self.seed, self.frames, self.fps, self.faults = seed, frames, fps, faults
-        self.camera = Camera.from_field_of_view(size, 60.0, 1.4, pitch=0.03)
+        self.camera = Camera.from_field_of_view(as_size(size), 60.0, 1.4, pitch=0.03)
         self.duration = frames / fps
         rng = np.random.default_rng((seed, 0xD21FE))
         self._speed = float(rng.uniform(20, 25))
