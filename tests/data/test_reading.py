@@ -62,6 +62,18 @@ def test_what_marks_a_crowd(value: object, crowd: bool) -> None:
     assert is_crowd({"attributes": {"crowd": value}}) == crowd
 
 
+@pytest.mark.parametrize(
+    ("class_names", "last"), [(("vehicle",), [(8, 8)]), (("vehicle", "zebra"), [(index, 8) for index in range(1, 9)])]
+)
+def test_annotations_looked_at_are_counted(root: Path, class_names: tuple[str, ...], last: list[object]) -> None:
+    calls: list[object] = []
+    DrivingDataset(root, "train", class_names=class_names).warn_of_foreign(lambda *call: calls.append(call))
+    assert calls == last
+    calls.clear()
+    sampling_weights(DrivingDataset(root, "train"), {"timeofday": {}}, lambda *call: calls.append(call))
+    assert calls == [(index, 8) for index in range(1, 9)]
+
+
 def test_an_image_is_rgb(root: Path) -> None:
     red = np.zeros((72, 128, 3), np.uint8)
     red[..., 2] = 255  # OpenCV writes BGR

@@ -110,12 +110,12 @@ def evaluate(
         _check_artefact(model, predictor, protocol)
         resized = _resized(predictor, resolution)
         dataset = DrivingDataset(data, split, class_names=predictor.card.class_names)
+        shown = stack.enter_context(show_progress("images"))
         if "detection" in predictor.card.tasks:
-            dataset.warn_of_foreign()
+            dataset.warn_of_foreign(shown)
         writer = None
         if save is not None:
             writer = stack.enter_context(PredictionWriter(save, predictor.card.tasks, overwrite=overwrite))
-        shown = stack.enter_context(show_progress("images"))
         report = run_evaluation(
             predictor,
             dataset,

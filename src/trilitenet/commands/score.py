@@ -75,9 +75,9 @@ def score(
             f"{predictions}: predictions for none of the {len(dataset)} images "
             f"(such as {min(saved.names)!r}); image_id must be the name of the image without ending"
         )
-    if "detection" in saved.tasks:
-        dataset.warn_of_foreign()
     with show_progress("images") as shown:
+        if "detection" in saved.tasks:
+            dataset.warn_of_foreign(shown)
         report = score_predictions(
             saved,
             dataset,

@@ -117,13 +117,13 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
     torch.manual_seed(config.seed)
     with _display(quiet=not fabric.is_global_zero) as display:
         dataset = training_data(config)
-        _check_labels(config, dataset)
+        _check_labels(config, dataset, display)
         loader = build_loader(
             dataset,
             _transform(config, dataset, display),
             batch_size=config.batch_size // config.accumulate,
             seed=config.seed,
-            weights=sampling_weights(dataset, config.sampling) if config.sampling else None,
+            weights=sampling_weights(dataset, config.sampling, display.labels) if config.sampling else None,
             samples_per_epoch=config.samples_per_epoch,
             workers=config.workers,
             pin_memory=fabric.device.type == "cuda",
@@ -202,8 +202,8 @@ def training_data(config: TrainConfig) -> SampleSource:
     return MixedDataset([(first, 1.0), *more])
 
 
-def _check_labels(config: TrainConfig, dataset: SampleSource) -> None:
-    """Warn of tasks that no image is labelled for, and of classes that no box is of.
+def _check_labels(config: TrainConfig, dataset: SampleSource, display: _Display) -> None:
+    """Warn of tasks that no image is labelled for, of classes that no box is of, and of those that are not learnt.
 
     Raises:
         DataError: If there are no labels at all, and no teacher.
@@ -219,7 +219,7 @@ def _check_labels(config: TrainConfig, dataset: SampleSource) -> None:
     if "detection" in config.tasks:
         for part in parts:
             if isinstance(part, DrivingDataset):
-                part.warn_of_foreign()
+                part.warn_of_foreign(display.labels)
 
 
 def _transform(config: TrainConfig, dataset: SampleSource, display: _Display) -> Transform:
@@ -385,6 +385,10 @@ class _Display:
     def validation(self, images: int, count: int) -> None:
         """Show how many images the network has been measured on, and of how many."""
         self._aside("validation", images, count)
+
+    def labels(self, images: int, count: int) -> None:
+        """Show of how many images the annotations have been looked at, and of how many they may have to be."""
+        self._aside("labels", images, count)
 
     def anchors(self, images: int, count: int) -> None:
         """Show of how many images the boxes have been read, and of how many they will be."""

@@ -18,7 +18,7 @@ import functools
 import hashlib
 import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -290,35 +290,38 @@ class DrivingDataset:
             digest.update(b"-" if data is None else hashlib.sha256(data.tobytes()).digest())
         return digest.hexdigest()[:16]
 
-    def classes_without_boxes(self) -> tuple[list[str], set[str]]:
+    def classes_without_boxes(self, progress: Callable[[int, int], None] | None = None) -> tuple[list[str], set[str]]:
         """Return the classes that no box is of, and the categories of the boxes; reads up to the first of each class.
 
-        Without any box both are empty.
+        Without any box both are empty. ``progress`` is called with (annotations looked at, images).
         """
         without, found = dict(enumerate(self._class_names)), set[str]()
-        for categories in self._categories():
+        for done, name in enumerate(self.names if "detection" in self._tasks else (), start=1):
+            categories = self._categories(name)
             found |= categories
             for category in categories & self._table.keys():
                 without.pop(self._table[category], None)
+            if progress:
+                progress(done if without else len(self), len(self))
             if not without:
                 break
         return list(without.values()) if found else [], found
 
-    def _categories(self) -> Iterator[set[str]]:
-        """Yield the categories of each image's boxes."""
-        for name in self.names if "detection" in self._tasks else ():
-            content = self._annotation(name)
-            if content is None:
-                continue
-            try:
-                items = [item for frame in content["frames"] for item in frame.get("objects") or ()]
-                yield {str(item["category"]) for item in items if item.get("box2d") is not None}
-            except (KeyError, TypeError, AttributeError):
-                continue  # told when the sample is read
+    def _categories(self, name: str) -> set[str]:
+        """Return the categories of an image's boxes."""
+        content = self._annotation(name)
+        try:
+            items = [item for frame in content["frames"] for item in frame.get("objects") or ()]
+            return {str(item["category"]) for item in items if item.get("box2d") is not None}
+        except (KeyError, TypeError, AttributeError):  # none, or a broken one, which is told when the sample is read
+            return set()
 
-    def warn_of_foreign(self) -> None:
-        """Warn of classes that no box is of, where boxes are of categories that mean nothing."""
-        without, found = self.classes_without_boxes()
+    def warn_of_foreign(self, progress: Callable[[int, int], None] | None = None) -> None:
+        """Warn of classes that no box is of, where boxes are of categories that mean nothing.
+
+        ``progress`` is called with (annotations looked at, images).
+        """
+        without, found = self.classes_without_boxes(progress)
         foreign = sorted(found - self._table.keys() - set(self.description.ignore))
         if without and foreign:
             _LOGGER.warning(
@@ -454,13 +457,18 @@ class MixedDataset:
         return self.parts[part][0], index - (int(self._ends[part - 1]) if part else 0)
 
 
-def sampling_weights(dataset: SampleSource, table: Mapping[str, Mapping[str, float]]) -> NDArray[np.float64]:
+def sampling_weights(
+    dataset: SampleSource,
+    table: Mapping[str, Mapping[str, float]],
+    progress: Callable[[int, int], None] | None = None,
+) -> NDArray[np.float64]:
     """Return how often each sample is to be drawn, from its attributes.
 
     Args:
         dataset: Any source of samples; the weights of a `MixedDataset` are multiplied in.
         table: Attribute -> value -> factor, for example ``{"timeofday": {"night": 2.0}, "source": {"dull": 0.5}}``.
             Values not listed count 1, and the factors of several attributes multiply. 0 leaves a sample out.
+        progress: Called with (samples whose attributes are read, samples in all).
 
     Returns:
         (N,) float64, relative weights.
@@ -481,6 +489,8 @@ def sampling_weights(dataset: SampleSource, table: Mapping[str, Mapping[str, flo
                 known.setdefault(attribute, set()).add(value)
             for attribute, factors in table.items():
                 weights[index] *= factors.get(attributes.get(attribute, ""), 1.0)
+            if progress:
+                progress(index + 1, len(dataset))
         for attribute, factors in table.items():
             if attribute not in known:
                 hint = did_you_mean(attribute, known)
