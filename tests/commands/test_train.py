@@ -190,6 +190,19 @@ def test_what_has_no_effect_is_told(scenes: Path, tmp_path: Path, caplog: pytest
         train(**settings(data, tmp_path / "lane", tasks=("lane",)))
 
 
+def test_classes_that_the_first_data_lacks_are_told(
+    scenes: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    extra = shutil.copytree(scenes, tmp_path / "extra")
+    (extra / "dataset.yaml").write_text("classes: {automobile: [car], person: [pedestrian], cycle: [bike]}\n")
+    more: dict[str, Any] = {"extra_data": {str(extra): 1.0}, "max_steps": 1, "val_split": ""}
+    train(**settings(scenes, tmp_path / "run", **more))
+    assert f"{extra}: boxes of person, cycle are background, as {scenes} has no such class; --classes" in caplog.text
+    caplog.clear()
+    train(**settings(scenes, tmp_path / "other", classes=("vehicle",), **more))
+    assert "are background" not in caplog.text
+
+
 def test_a_run_that_cannot_start_leaves_the_earlier_one(
     scenes: Path, begun: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

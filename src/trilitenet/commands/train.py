@@ -48,7 +48,7 @@ from trilitenet.engine.results import write_results
 from trilitenet.engine.runtime import follow, running_fabric
 from trilitenet.engine.train import CHECKPOINT_NAME, Trainer, TrainResult, holds_run
 from trilitenet.engine.transfer import freeze, initialise
-from trilitenet.errors import ConfigError, DataError, OutputError, TriLiteNetError, import_extra
+from trilitenet.errors import ConfigError, DataError, OutputError, TriLiteNetError, few, import_extra
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.torch_backend import TorchBackend
 from trilitenet.losses.detection import DetectionLoss
@@ -220,6 +220,13 @@ def _check_labels(config: TrainConfig, dataset: SampleSource, display: _Display)
         for part in parts:
             if isinstance(part, DrivingDataset):
                 part.warn_of_foreign(display.labels)
+                if config.classes is None and (others := part.classes_left_out()):
+                    _LOGGER.warning(
+                        "%s: boxes of %s are background, as %s has no such class; --classes says what is learnt",
+                        part.root,
+                        few(others, most=10),
+                        config.data,
+                    )
 
 
 def _transform(config: TrainConfig, dataset: SampleSource, display: _Display) -> Transform:

@@ -316,6 +316,10 @@ class DrivingDataset:
         except (KeyError, TypeError, AttributeError):  # none, or a broken one, which is told when the sample is read
             return set()
 
+    def classes_left_out(self) -> list[str]:
+        """Return the classes of ``dataset.yaml`` whose boxes are all read as background."""
+        return [name for name, own in self.description.classes.items() if self._table.keys().isdisjoint(own)]
+
     def warn_of_foreign(self, progress: Callable[[int, int], None] | None = None) -> None:
         """Warn of classes that no box is of, where boxes are of categories that mean nothing.
 
