@@ -324,6 +324,8 @@ def test_a_condition_that_an_image_lacks_is_undefined(root: Path) -> None:
 def test_labels_of_tasks_that_are_not_labelled_at_all_do_not_count(root: Path) -> None:
     (root / "dataset.yaml").write_text("tasks: [lane]\n")
     truncate(root / "da_seg_annotations/train/train_0001.png")
+    for name in ("stray.png", "train_0001.jpg"):
+        (root / "da_seg_annotations/train" / name).touch()
     annotate(root, box(1, 2, 30, 40, "unicorn"), box(1, 2, 30, 40, "unicorn"), {"category": "car", "box2d": {"x1": 3}})
     assert DrivingDataset(root, "train")[0].boxes is None
     report = check_dataset(root)

@@ -269,7 +269,7 @@ def check_dataset(
         collector.add("index", "", str(error))
         index = []
     _find_classes(job, facts, collector)
-    _find_orphans(root, names, collector)
+    _find_orphans(job, names, collector)
     _find_names(facts, collector)
     _find_duplicates(facts, collector)
     _find_near_duplicates(facts, collector)
@@ -477,10 +477,12 @@ def _find_classes(job: _Job, facts: dict[str, list[_Facts]], collector: _Collect
         collector.add("no-class", "", f"boxes are of {_listed(found)}; classes are of {_listed(job.table)}")
 
 
-def _find_orphans(root: Path, names: dict[str, list[str]], collector: _Collector) -> None:
+def _find_orphans(job: _Job, names: dict[str, list[str]], collector: _Collector) -> None:
     """Look for label files that belong to no image, or that are passed over for their ending."""
-    for folder, ending in LABEL_FILES.values():
-        if not (root / folder).is_dir():
+    root = job.root
+    for task, (folder, ending) in LABEL_FILES.items():
+        read = task == "detection" or task in job.description.tasks  # annotations hold the attributes, too
+        if not (read and (root / folder).is_dir()):
             continue
         for split in sorted(path.name for path in (root / folder).iterdir() if path.is_dir()):
             images = {Path(name).stem for name in names.get(split, ())}
