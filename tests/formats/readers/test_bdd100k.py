@@ -87,6 +87,16 @@ def test_drivable_masks_of_every_kind(tmp_path: Path, kind: str, keep: bool) -> 
     assert dataset[1].drivable is None
 
 
+def test_several_entries_of_one_image_are_told(tmp_path: Path) -> None:
+    raw_bdd.write_images(tmp_path)
+    entries: list[dict[str, Any]] = [{"name": name, "labels": []} for name in ("one/a1.jpg", "two/a1.jpg", "a2.jpg")]
+    write_entries(tmp_path / "labels/det_20/det_train.json", entries)
+    source = read_bdd100k(tmp_path)
+    with pytest.raises(DataError, match=r"det_train\.json: has several entries called 'a1'"):
+        source.record("train", "a1")
+    assert source.record("train", "a2").objects == ()
+
+
 def test_polygons_can_keep_two_areas(raw: Path, tmp_path: Path) -> None:
     convert(read_bdd100k(raw), tmp_path / "out", ConversionOptions(keep_alternative=True))
     mask = cv2.imread(str(tmp_path / "out/da_seg_annotations/train/a1.png"), cv2.IMREAD_UNCHANGED)

@@ -122,6 +122,11 @@ class BddSource:
             DataError: If they are broken.
         """
         files = self._splits[split]
+        twice = [path for path, count in Counter(part.path for part in files.parts.get(name, ())).items() if count > 1]
+        if twice:
+            raise DataError(
+                f"{twice[0]}: has several entries called {name!r}; give one of them, and its image, another name"
+            )
         merged = ImageRecord(name, files.images[name])
         for content, path in _entries(files, name):
             tasks = files.tasks[files.documents if path.parent == files.documents else path]
