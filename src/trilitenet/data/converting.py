@@ -395,7 +395,8 @@ def _convert_one(record: ImageRecord, split: str, root: Path, options: Conversio
         summary["objects"] = dict(sorted(counts.items()))
     if record.drivable is not None:
         if isinstance(record.drivable, MaskFile):
-            mask = _mask_of(record.drivable, size, keep_alternative=options.keep_alternative)
+            mask, told = _mask_of(record.drivable, size, keep_alternative=options.keep_alternative)
+            dropped["drivable: mask with values that nothing explains"] += told
         else:
             mask = drivable_mask(record.drivable, size, keep_alternative=options.keep_alternative)
             dropped["area with too few points"] += sum(
@@ -405,7 +406,8 @@ def _convert_one(record: ImageRecord, split: str, root: Path, options: Conversio
         summary["labelled"].append("drivable")
     if record.lane is not None:
         if isinstance(record.lane, MaskFile):
-            mask = _mask_of(record.lane, size, keep_alternative=False)
+            mask, told = _mask_of(record.lane, size, keep_alternative=False)
+            dropped["lane: mask with values that nothing explains"] += told
             summary["lanes"] = {"masks": 1}
         else:
             mask, drawn, left_out = lane_mask(record.lane, size, options.width(split), options)
@@ -461,8 +463,12 @@ def _has_ignored(labels: tuple[AreaLabel | LaneLabel | RunLabel, ...] | MaskFile
     return any(getattr(label, "kind", "") == "ignore" for label in labels or ())
 
 
-def _mask_of(file: MaskFile, size: tuple[int, int], *, keep_alternative: bool) -> NDArray[np.uint8]:
-    """Return the mask that a picture holds: 255 foreground, 127 alternative if kept apart, 64 ignored."""
+def _mask_of(file: MaskFile, size: tuple[int, int], *, keep_alternative: bool) -> tuple[NDArray[np.uint8], bool]:
+    """Return the mask that a picture holds, and whether values without a meaning, which are background, are to be told.
+
+    The mask is 255 foreground, 127 alternative if kept apart, 64 ignored. Values without a meaning are to be told where
+    the background has been given one, and where the picture holds no value with a meaning.
+    """
     try:
         with Image.open(file.path) as picture:
             picture.load()
@@ -480,13 +486,16 @@ def _mask_of(file: MaskFile, size: tuple[int, int], *, keep_alternative: bool) -
     if pixels.shape != size:
         raise DataError(f"{file.path}: mask of {pixels.shape[1]}x{pixels.shape[0]}, image of {size[1]}x{size[0]}")
     if not file.values:
-        return np.where(pixels > 0, 255, 0).astype(np.uint8)
+        return np.where(pixels > 0, 255, 0).astype(np.uint8), False
     mask = np.zeros(size, np.uint8)
+    known = np.zeros(size, np.bool_)
     for value, meaning in file.values.items():
-        code = (value[0] << 16) | (value[1] << 8) | value[2] if isinstance(value, tuple) else value
-        level = _level(meaning, keep_alternative=keep_alternative)
-        mask[pixels == code] = level
-    return mask
+        where = pixels == ((value[0] << 16) | (value[1] << 8) | value[2] if isinstance(value, tuple) else value)
+        known |= where
+        if meaning != "background":
+            mask[where] = _level(meaning, keep_alternative=keep_alternative)
+    complete = "background" in file.values.values()
+    return mask, bool((complete or not known.any()) and (pixels[~known] != 0).any())
 
 
 def _write_mask(path: Path, mask: NDArray[np.uint8]) -> None:

@@ -172,9 +172,9 @@ class MaskFile:
 
     Attributes:
         path: The picture.
-        values: Pixel value -> ``"direct"``, ``"alternative"``, ``"foreground"``, ``"ignore"``; other values are
-            background. Keys are grey levels or indices (int), or ``(red, green, blue)``. Empty: every value above 0
-            is foreground.
+        values: Pixel value -> ``"direct"``, ``"alternative"``, ``"foreground"``, ``"ignore"``, ``"background"``; other
+            values are background, too, and told where that is named. Keys are grey levels or indices (int), or
+            ``(red, green, blue)``. Empty: every value above 0 is foreground.
     """
 
     path: Path

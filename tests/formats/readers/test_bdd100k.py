@@ -87,6 +87,20 @@ def test_drivable_masks_of_every_kind(tmp_path: Path, kind: str, keep: bool) -> 
     assert dataset[1].drivable is None
 
 
+@pytest.mark.parametrize("kind", ["ids 2018", "ids 2020"])
+def test_values_that_the_masks_of_bdd100k_do_not_have_are_told(tmp_path: Path, kind: str) -> None:
+    raw_bdd.write_images(tmp_path)
+    raw_bdd.write_2020(tmp_path, polygons=False, masks=kind)
+    (path,) = tmp_path.rglob("a1*.png")
+    mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert mask is not None
+    for value, count in ((0, 0), (3, 1)):
+        mask[0] = value
+        cv2.imwrite(str(path), mask)
+        report = convert(read_bdd100k(tmp_path), tmp_path / "out")
+        assert report.dropped["train"].get("drivable: mask with values that nothing explains", 0) == count
+
+
 def test_several_entries_of_one_image_are_told(tmp_path: Path) -> None:
     raw_bdd.write_images(tmp_path)
     entries: list[dict[str, Any]] = [{"name": name, "labels": []} for name in ("one/a1.jpg", "two/a1.jpg", "a2.jpg")]
@@ -121,10 +135,12 @@ def test_lane_masks_of_2020_are_read_where_there_are_no_polygons(tmp_path: Path)
     mask[2] = 6 | 16  # single white, dashed
     mask[3] = 6 | 32  # single white across the road
     cv2.imwrite(str(folder / "a1.png"), mask)
+    cv2.imwrite(str(folder / "a2.png"), np.full(raw_bdd.SIZE, 255, np.uint8))
     report = convert(read_bdd100k(raw), tmp_path / "out")
+    assert not [reason for reason in report.dropped["train"] if "nothing explains" in reason]
     lane = cv2.imread(str(tmp_path / "out/ll_seg_annotations/train/a1.png"), cv2.IMREAD_UNCHANGED)
     assert np.flatnonzero(np.asarray(lane).any(axis=1)).tolist() == [2]
-    assert report.lanes["train"] == {"masks": 1}
+    assert report.lanes["train"] == {"masks": 2}
 
 
 def test_index_of_a_large_file_survives_chunk_borders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -77,6 +77,22 @@ def test_what_was_written_comes_back(root: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(np.asarray(one), np.asarray(two))
 
 
+@pytest.mark.parametrize(
+    ("values", "count"),
+    [({7: "foreground"}, 0), ({7: "foreground", 200: "background"}, 1), ({7: "foreground", 200: "background",
+     8: "background"}, 0), ({1: "foreground"}, 1), ({}, 0)],
+)  # fmt: skip
+def test_values_that_nothing_explains_are_told(
+    root: Path, tmp_path: Path, values: dict[str | int, str], count: int
+) -> None:
+    rule = MaskRule("markings/{split}/{name}.png", values)
+    mapping = LabelMapping(images="frames/{split}", tasks=("lane",), lane_mask=rule)
+    cv2.imwrite(str(root / "markings/train/b.png"), np.zeros(SIZE, np.uint8))
+    report = convert(read_masks(root, mapping), tmp_path / "out")
+    assert report.labelled["train"] == {"lane": 2}
+    assert report.dropped["train"].get("lane: mask with values that nothing explains", 0) == count
+
+
 def test_default_is_everything_above_zero(tmp_path: Path) -> None:
     assert MaskRule("x").meanings() == {}
     with pytest.raises(DataError, match="no images"):

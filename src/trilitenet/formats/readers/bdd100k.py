@@ -35,8 +35,8 @@ __all__ = ["BDD100K_SPLITS", "BddSource", "parse_labels", "read_bdd100k"]
 
 BDD100K_SPLITS: Final = ("train", "val", "test")
 
-DRIVABLE_IDS_2018: Final = {1: "direct", 2: "alternative"}
-DRIVABLE_IDS_2020: Final = {0: "direct", 1: "alternative"}
+DRIVABLE_IDS_2018: Final = {0: "background", 1: "direct", 2: "alternative"}
+DRIVABLE_IDS_2020: Final = {0: "direct", 1: "alternative", 2: "background"}
 DRIVABLE_COLOURS: Final[dict[int | tuple[int, int, int], str]] = {
     (217, 83, 79): "direct",
     (91, 192, 222): "alternative",
@@ -498,9 +498,9 @@ def _drivable_masks(
 
 
 def _lane_values(*, crosswalk: bool, vertical: bool) -> dict[int | tuple[int, int, int], str]:
-    """Return the values of a 2020 lane mask that count as marking."""
-    return {
-        value: "foreground"
-        for value in range(64)
-        if not value & 8 and (vertical or not value & 32) and (crosswalk or value & 7)
-    }
+    """Return what the values of a 2020 lane mask mean, of which some count as marking."""
+    values: dict[int | tuple[int, int, int], str] = {255: "background"}
+    for value in range(64):
+        marking = not value & 8 and (vertical or not value & 32) and (crosswalk or value & 7)
+        values[value] = "foreground" if marking else "background"
+    return values

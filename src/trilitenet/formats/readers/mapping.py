@@ -41,8 +41,9 @@ class MaskRule:
 
     Attributes:
         path: From the data set's root, with ``{split}`` and ``{name}``.
-        values: Value -> ``direct``, ``alternative``, ``foreground`` or ``ignore``. A value is a grey level or index
-            (``7``) or a colour (``"128, 64, 128"`` or ``"#804080"``). Empty: everything above 0 is foreground.
+        values: Value -> ``direct``, ``alternative``, ``foreground``, ``ignore`` or ``background``. A value is a grey
+            level or index (``7``) or a colour (``"128, 64, 128"`` or ``"#804080"``); see `MaskFile` for others. Empty:
+            everything above 0 is foreground.
     """
 
     path: str
@@ -58,8 +59,7 @@ class MaskRule:
         for value, kind in self.values.items():
             if kind not in _KINDS:
                 raise ConfigError(f"mask value {value!r} means {kind!r}; known: {', '.join(_KINDS)}")
-            if kind != "background":
-                parsed[parse_colour(value)] = kind
+            parsed[parse_colour(value)] = kind
         if len({isinstance(value, tuple) for value in parsed}) > 1:
             raise ConfigError("mask values are either all levels or all colours")
         return parsed
