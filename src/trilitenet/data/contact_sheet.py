@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.sample import Sample
-from trilitenet.processing.drawing import draw
+from trilitenet.processing.drawing import draw, line_thickness
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.structures import Boxes, Perception
 
@@ -56,7 +56,7 @@ def draw_sample(sample: Sample, class_names: Sequence[str]) -> NDArray[np.uint8]
             rows, columns = np.indices(sample.size)
             canvas[~valid & ((rows + way * columns) % 8 < 2)] = _INVALID_COLOUR
     for x1, y1, x2, y2 in np.rint(sample.ignored).astype(int).tolist():
-        cv2.rectangle(canvas, (x1, y1), (x2 - 1, y2 - 1), _IGNORED_COLOUR, 1)
+        cv2.rectangle(canvas, (x1, y1), (x2 - 1, y2 - 1), _IGNORED_COLOUR, line_thickness(canvas))
     return canvas
 
 

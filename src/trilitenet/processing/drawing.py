@@ -30,6 +30,7 @@ __all__ = [
     "draw",
     "draw_boxes",
     "draw_label",
+    "line_thickness",
 ]
 
 Colour: TypeAlias = tuple[int, int, int]
@@ -166,9 +167,8 @@ def draw_boxes(canvas: NDArray[np.uint8], boxes: Boxes, class_names: tuple[str, 
         class_names: Names of the classes.
         labels: Write the labels too.
     """
-    height, width = canvas.shape[:2]
-    thickness = max(1, round(max(height, width) / 400))
-    corners = np.clip(boxes.xyxy, -2 * thickness, max(height, width) + 2 * thickness)  # OpenCV counts to 2**31
+    thickness, beyond = line_thickness(canvas), max(canvas.shape)
+    corners = np.clip(boxes.xyxy, -2 * thickness, beyond + 2 * thickness)  # OpenCV counts to 2**31
     for i in range(len(boxes) - 1, -1, -1):
         track = -1 if boxes.track_id is None else int(boxes.track_id[i])
         class_id = int(boxes.class_id[i])
@@ -179,6 +179,12 @@ def draw_boxes(canvas: NDArray[np.uint8], boxes: Boxes, class_names: tuple[str, 
             words = [class_names[class_id]] if len(class_names) > 1 else []
             words.append(f"{boxes.confidence[i]:.2f}" if track < 0 else f"#{track}")
             draw_label(canvas, " ".join(words), (left, top), colour)
+
+
+def line_thickness(canvas: NDArray[np.uint8]) -> int:
+    """Return how thick the lines of boxes are, in pixels of a picture."""
+    thickness: int = max(1, round(max(canvas.shape) / 400))
+    return thickness
 
 
 def draw_label(
