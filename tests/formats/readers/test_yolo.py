@@ -144,6 +144,13 @@ def test_label_files_of_no_image_are_told(root: Path) -> None:
     assert found == f"1 label files are of no image in a split, such as {root / 'labels/train/a-2.txt'}"
 
 
+def test_a_list_whose_images_are_all_elsewhere_names_them(root: Path) -> None:
+    (root / "data.yaml").write_text("train: train.txt\nnames: [car]\n")
+    (root / "train.txt").write_text("data/images/train/a.jpg\n" * 4)
+    with pytest.raises(DataError, match=r"no images; looked in .*/train\.txt; listed and not there: .* and 1 more$"):
+        read_yolo(root)
+
+
 def test_images_of_one_name_and_folder_are_refused(root: Path) -> None:
     cv2.imwrite(str(root / "images/train/a.png"), np.zeros((*SIZE, 3), np.uint8))
     with pytest.raises(DataError, match=r"two images are called 'a' in split 'train': .*a\.\w+ and .*a\.\w+; rename"):
@@ -185,7 +192,8 @@ def test_lists_of_images(root: Path) -> None:
     (root / "data.yaml").write_text("train: train.txt\nnames: [car]\n")
     source = read_yolo(root)
     assert source.names("train") == ["a", "b c"]
-    assert source.found == ("train: 2 images", "train: 1 listed images are not there")
+    gone = root / "images/train/gone.jpg"
+    assert source.found == ("train: 2 images", f"train: 1 listed images are not there, such as {gone}")
 
 
 def test_the_validation_split_may_be_called_valid(root: Path) -> None:

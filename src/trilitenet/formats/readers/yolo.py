@@ -6,7 +6,7 @@ confidence) and https://docs.ultralytics.com/datasets/segment/ (``class x1 y1 x2
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +15,7 @@ import numpy as np
 from trilitenet.config import Task, read_yaml
 from trilitenet.data.reading import IMAGE_ENDINGS
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ObjectLabel, image_size, name_apart, same_name
-from trilitenet.errors import ConfigError, DataError, brief
+from trilitenet.errors import ConfigError, DataError, brief, few
 from trilitenet.formats.readers.mapping import LabelMapping, Labels, hull
 
 __all__ = ["YoloSource", "read_yolo"]
@@ -127,7 +127,7 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise DataError(f"{path}: not a YOLO data file ({brief(error)})") from error
     listed: dict[str, list[Path]] = defaultdict(list)
-    missing: Counter[str] = Counter()
+    missing: dict[str, list[Path]] = defaultdict(list)
     looked: dict[Path, None] = {}
     for key, split in (("train", "train"), ("val", "val"), ("valid", "val"), ("test", "test")):
         places = content.get(key)
@@ -137,10 +137,7 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
             candidates = _candidates(base, path.parent, str(place))
             looked |= dict.fromkeys(root / part for root, part in candidates)
             for image in _images_at(candidates):
-                if not image.is_file():
-                    missing[split] += 1
-                else:
-                    listed[split].append(image)
+                (listed if image.is_file() else missing)[split].append(image)
     if content.get("train") == content.get("val"):
         listed.pop("val", None)
     images: dict[str, dict[str, Path]] = defaultdict(dict)
@@ -150,11 +147,15 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
                 raise same_name(name, split, images[split][name], image)
     if not images:
         words = f"looked in {', '.join(map(str, looked))}" if looked else "it names no folder as train, val or test"
+        if missing:
+            words += f"; listed and not there: {few([str(image) for paths in missing.values() for image in paths])}"
         raise DataError(f"{path}: no images; {words}")
     table = {key: str(value) for key, value in table.items()}
     mapping.check_categories(set(table.values()), path)
     found = [f"{split}: {len(items)} images" for split, items in images.items()]
-    found += [f"{split}: {count} listed images are not there" for split, count in missing.items()]
+    found += [
+        f"{split}: {len(paths)} listed images are not there, such as {paths[0]}" for split, paths in missing.items()
+    ]
     labels = {_label_path(image): image for items in images.values() for image in items.values()}
     folders = {path.parent for path, image in labels.items() if path.parent != image.parent}
     stray = {path for folder in folders for path in folder.glob("*.txt") if path.name != "classes.txt"} - labels.keys()
