@@ -89,6 +89,14 @@ def test_pixels_and_numbers_of_tracks_are_no_coordinates(root: Path, line: str, 
         read_yolo(root).record("train", "a")
 
 
+def test_key_points_are_no_polygon(root: Path) -> None:
+    with (root / "data.yaml").open("a") as file:
+        file.write("kpt_shape: [2, 2]\n")
+    (root / "labels/train/a.txt").write_text("0 0.5 0.5 0.5 0.5 0.1 0.1 0.2 0.2\n")
+    (item,) = read_yolo(root).record("train", "a").objects or ()
+    assert item.box == pytest.approx((20, 12, 60, 36))
+
+
 def test_errors(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"no data\.yaml"):
         read_yolo(tmp_path)

@@ -2,6 +2,7 @@
 
 Format: https://docs.ultralytics.com/datasets/detect/ (``class cx cy w h``, all in [0, 1]; a sixth number is a
 confidence) and https://docs.ultralytics.com/datasets/segment/ (``class x1 y1 x2 y2 x3 y3 ...``).
+Of key points (``kpt_shape`` in ``data.yaml``) the boxes are read.
 """
 
 from __future__ import annotations
@@ -38,11 +39,14 @@ class YoloSource:
         names: dict[int, str],
         mapping: LabelMapping,
         found: tuple[str, ...],
+        *,
+        key_points: bool,
     ) -> None:
         self.origin = mapping.origin("yolo", root)
         self._images = images
         self._names = names
         self._mapping = mapping
+        self._key_points = key_points
         self._tasks: set[Task] = mapping.labelled(set(names.values()))
         self.found = found
 
@@ -79,6 +83,8 @@ class YoloSource:
                 values = np.array([float(word) for word in words[1:]])
             except (ValueError, OverflowError) as error:
                 raise DataError(f"{path}, line {number}: not numbers ({error})") from error
+            if self._key_points:  # which follow the box
+                values = values[:4]
             coordinates = values[:4] if len(values) in (4, 5) else values
             wrong = coordinates[~(np.abs(coordinates) <= _BEYOND)]  # what is no number, too
             if len(wrong):
@@ -161,7 +167,7 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
     stray = {path for folder in folders for path in folder.glob("*.txt") if path.name != "classes.txt"} - labels.keys()
     if stray:
         found.append(f"{len(stray)} label files are of no image in a split, such as {min(stray)}")
-    return YoloSource(path, dict(images), table, mapping, tuple(found))
+    return YoloSource(path, dict(images), table, mapping, tuple(found), key_points="kpt_shape" in content)
 
 
 def _find_yaml(root: Path) -> Path:
