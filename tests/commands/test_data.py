@@ -53,6 +53,17 @@ def test_convert_both_ways(raw: Path, tmp_path: Path, capsys: pytest.CaptureFixt
         assert path.read_bytes() == (tmp_path / "two" / path.relative_to(tmp_path / "one")).read_bytes()
 
 
+def test_convert_shows_that_it_reads_the_labels(
+    raw: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which are over a gigabyte of BDD100K, and minutes."""
+    for name, value in (("FORCE_COLOR", "1"), ("TERM", "xterm"), ("COLUMNS", "80")):
+        monkeypatch.setenv(name, value)
+    convert("bdd100k", raw, tmp_path / "out", workers=1)
+    shown = capsys.readouterr().err
+    assert 0 < shown.index("reading the labels") < shown.index("images")
+
+
 def test_convert_says_that_lane_masks_keep_their_width(raw: Path, tmp_path: Path) -> None:
     said = "lane masks keep the width they are drawn in; --lane-width is for lines"
     assert said not in convert("bdd100k", raw, tmp_path / "lines", workers=1).summary()

@@ -147,7 +147,8 @@ def convert(
         keep_alternative=keep_alternative,
         images=images,
     )
-    records, found = _open_source(chosen, raw, mapping, options)
+    with show_progress("reading the labels"):
+        records, found = _open_source(chosen, raw, mapping, options)
     unknown = {item.rpartition("=")[0] for item in lane_width} - {"", "*", *records.splits}
     if unknown:
         raise ConfigError(f"--lane-width names no split {min(unknown)!r}; there are {', '.join(records.splits)}")
