@@ -13,7 +13,7 @@ from PIL import Image
 
 from tests.formats.readers import raw_bdd
 from trilitenet.data.converting import ConversionOptions, convert, drivable_mask, lane_mask
-from trilitenet.data.description import read_description
+from trilitenet.data.description import DatasetDescription, read_description
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.records import (
     AreaLabel,
@@ -277,6 +277,22 @@ def test_splits_one_by_one_are_reported_together(tmp_path: Path) -> None:
     report = convert(source, tmp_path / "out", splits=["val"])
     assert report.images == {"train": 1, "val": 1}
     assert json.loads((tmp_path / "out/conversion.json").read_text()) == report.to_dict()
+
+
+def test_what_was_added_to_the_description_stays(tmp_path: Path) -> None:
+    first = picture(tmp_path / "raw/a.png", objects=(CAR,))
+    source = Records(train=[first])
+    convert(source, tmp_path / "out", description=DatasetDescription(licence="MIT"))
+    with (tmp_path / "out/dataset.yaml").open("a") as file:
+        file.write("ego_mask: bonnet.png\ntasks: [detection]\n")
+    before = (tmp_path / "out/dataset.yaml").read_text()
+    convert(source, tmp_path / "out")
+    assert (tmp_path / "out/dataset.yaml").read_text() == before
+    source = Records(train=[first], val=[picture(tmp_path / "raw/b.png", objects=(CAR,))])
+    convert(source, tmp_path / "out", description=DatasetDescription(licence="CC0"))
+    about = read_description(tmp_path / "out")
+    assert (about.ego_mask, about.tasks) == ("bonnet.png", ("detection",))
+    assert (about.name, about.licence, about.splits) == ("out", "CC0", ("train", "val"))
 
 
 def test_splits_without_images_are_left_out(tmp_path: Path) -> None:

@@ -152,9 +152,7 @@ def convert(
     unknown = {item.rpartition("=")[0] for item in lane_width} - {"", "*", *records.splits}
     if unknown:
         raise ConfigError(f"--lane-width names no split {min(unknown)!r}; there are {', '.join(records.splits)}")
-    description = DatasetDescription(
-        name=mapping.name or out.name, licence=mapping.licence, source=f"{chosen}: {Path(raw).name}"
-    )
+    description = DatasetDescription(name=mapping.name, licence=mapping.licence, source=f"{chosen}: {Path(raw).name}")
     with show_progress("images") as advance:
         report = run_conversion(
             records,

@@ -163,7 +163,7 @@ def convert(
         options: What to make of the labels.
         splits: Only these; all if left out.
         workers: Processes; 0 converts in this one.
-        description: Name, licence and the like for ``dataset.yaml``.
+        description: Name, licence and the like for ``dataset.yaml``; what it leaves out stays as it is there.
         progress: Called with (images done, images in all).
 
     Raises:
@@ -680,14 +680,20 @@ def _finish(
     _write(root / "index.csv", text.getvalue())
     _write(root / "conversion.json", json.dumps(report.to_dict(), indent=1, sort_keys=True))
     values = {255: "direct", ALTERNATIVE_VALUE: "alternative"} if options.keep_alternative else {255: "drivable"}
+    default = DatasetDescription()
+    given = vars(description or default).items()
+    before = read_description(root)  # with what has been added by hand, an ego mask for example
     whole = dataclasses.replace(
-        description or DatasetDescription(name=root.name),
-        classes=dict(options.classes),
-        ignore=options.ignore,
-        splits=tuple(sorted(split for split, count in report.images.items() if count)),
-        attributes=tuple(sorted(columns)),
-        drivable=MaskMeaning(values=values, ignore=ignore),
-        lane=MaskMeaning(values={255: "lane marking"}, ignore=ignore),
+        before,
+        **{key: value for key, value in given if value != getattr(default, key)}
+        | {
+            "classes": dict(options.classes),
+            "ignore": options.ignore,
+            "splits": tuple(sorted(split for split, count in report.images.items() if count)),
+            "attributes": tuple(sorted(columns)),
+            "drivable": MaskMeaning(values=values, ignore=ignore),
+            "lane": MaskMeaning(values={255: "lane marking"}, ignore=ignore),
+        },
     )
-    if not (root / DESCRIPTION_FILE).is_file() or read_description(root) != whole:
+    if not (root / DESCRIPTION_FILE).is_file() or before != whole:
         write_description(root, whole)
