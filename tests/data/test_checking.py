@@ -321,6 +321,13 @@ def test_a_condition_that_an_image_lacks_is_undefined(root: Path) -> None:
     assert "speed" not in conditions  # numbers
 
 
+def test_hidden_files_are_passed_over(root: Path) -> None:
+    before = check_dataset(root)
+    for path in [path for path in root.rglob("*") if path.is_file()]:
+        path.with_name(f"._{path.name}").write_bytes(b"\0\5\26\7")
+    assert check_dataset(root) == before
+
+
 def test_labels_of_tasks_that_are_not_labelled_at_all_do_not_count(root: Path) -> None:
     (root / "dataset.yaml").write_text("tasks: [lane]\n")
     truncate(root / "da_seg_annotations/train/train_0001.png")

@@ -317,3 +317,10 @@ def test_of_two_ego_masks_that_fit_a_name_the_one_that_says_more_of_it_counts(ro
         assert valid is not None
         found.append(int((~valid).all(axis=1).sum()))
     assert found == [20, 10]
+
+
+def test_hidden_files_are_no_images(root: Path) -> None:
+    """macOS puts a file of its own beside each, for example on a memory stick."""
+    before = DrivingDataset(root, "train").names
+    (root / "images/train/._train_0001.jpg").write_bytes(b"\0\5\26\7")
+    assert DrivingDataset(root, "train").names == before

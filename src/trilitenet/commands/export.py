@@ -20,7 +20,7 @@ import trilitenet
 from trilitenet.commands.load import open_backend
 from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, optional_path
 from trilitenet.config import ARTEFACT_KEY, ARTEFACT_SUFFIXES, CARD_KEY, ArtefactInfo, Task, check_size
-from trilitenet.data.reading import IMAGE_ENDINGS, DrivingDataset
+from trilitenet.data.reading import DrivingDataset, is_image_file
 from trilitenet.deploy.graph import DeployGraph, Masks, Traceable
 from trilitenet.deploy.layouts import pick_layout
 from trilitenet.deploy.ncnn import build_ncnn, save_ncnn
@@ -368,7 +368,7 @@ def find_pictures(source: Path, count: int, split: str) -> list[Path]:
         if split == "train" and (images / "val").is_dir():
             raise InputError(f"{source}: has no train split to calibrate on; give a folder of other pictures")
         folder = images if images.is_dir() else source  # a data set's masks are no pictures
-    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_ENDINGS)
+    paths = sorted(path for path in folder.rglob("*") if is_image_file(path.name))
     if not paths:
         raise InputError(f"{source}: no pictures there")
     return _spread(paths, count)

@@ -26,11 +26,11 @@ from trilitenet.config import DEFAULT_ANCHORS, LONG_SIDE, parse_json
 from trilitenet.data.description import DatasetDescription, MaskMeaning, class_table, read_description
 from trilitenet.data.prepared import is_prepared
 from trilitenet.data.reading import (
-    IMAGE_ENDINGS,
     IMAGE_FOLDER,
     LABEL_FILES,
     decode_mask,
     is_crowd,
+    is_image_file,
     label_file,
     read_index,
 )
@@ -246,9 +246,7 @@ def check_dataset(
     description = read_description(root)
     job = _Job(root, description, class_table(description.class_names, description.classes))
     names = {
-        folder.name: sorted(
-            path.name for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS and not path.is_dir()
-        )
+        folder.name: sorted(path.name for path in folder.iterdir() if is_image_file(path.name) and not path.is_dir())
         for folder in sorted((root / IMAGE_FOLDER).iterdir())
         if folder.is_dir()
     }
@@ -488,10 +486,12 @@ def _find_orphans(job: _Job, names: dict[str, list[str]], collector: _Collector)
             images = {Path(name).stem for name in names.get(split, ())}
             for path in sorted((root / folder / split).iterdir()):
                 where = path.relative_to(root).as_posix()
+                if path.name.startswith("."):
+                    continue
                 if path.suffix == ending:
                     if path.stem not in images:
                         collector.add("orphan", split, where)
-                elif path.is_file() and not path.name.startswith("."):
+                elif path.is_file():
                     cure = "rename it to" if path.suffix.lower() == ending else "save it as"
                     collector.add("not-read", split, f"{where} is not read; {cure} {ending}")
 

@@ -37,13 +37,13 @@ from trilitenet.config import Task, check_size, parse_json
 from trilitenet.data.description import DESCRIPTION_FILE, read_description
 from trilitenet.data.reading import (
     FOLDERS,
-    IMAGE_ENDINGS,
     IMAGE_FOLDER,
     LABEL_FILES,
     PREPARED_FILE,
     DrivingDataset,
     SampleSource,
     decode_image,
+    is_image_file,
     label_file,
 )
 from trilitenet.data.sample import BOXES, MASKS, VALID, Sample
@@ -149,7 +149,7 @@ def prepare(
         chosen = list(splits)
     else:
         folders = sorted(path for path in (root / IMAGE_FOLDER).glob("*") if path.is_dir())
-        chosen = [path.name for path in folders if any(file.suffix.lower() in IMAGE_ENDINGS for file in path.iterdir())]
+        chosen = [path.name for path in folders if any(is_image_file(file.name) for file in path.iterdir())]
     if not chosen:
         raise DataError(
             f"{root}: no splits with images below {IMAGE_FOLDER}; expected the published layout, see docs/data.md"

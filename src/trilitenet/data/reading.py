@@ -44,6 +44,7 @@ __all__ = [
     "decode_image",
     "decode_mask",
     "is_crowd",
+    "is_image_file",
     "label_file",
     "parse_annotation",
     "read_index",
@@ -83,6 +84,11 @@ class SampleSource(Protocol):
 
     def attributes(self, index: int) -> dict[str, str]:
         """Return the attributes of a sample without decoding its image."""
+
+
+def is_image_file(name: str) -> bool:
+    """Return whether a file's name is one of an image; hidden ones, such as ``._0001.jpg`` of macOS, are none."""
+    return not name.startswith(".") and name.lower().endswith(IMAGE_ENDINGS)
 
 
 def label_file(task: Task, split: str, name: str) -> str:
@@ -531,9 +537,9 @@ def _image_files(root: Path, split: str) -> dict[str, str]:
         raise DataError(f"{root}: no folder {IMAGE_FOLDER}/{split}; expected the published layout, see docs/data.md")
     files: dict[str, str] = {}
     for file in sorted(path.name for path in folder.iterdir()):  # as text, which is many times as fast
-        name, dot, ending = file.rpartition(".")
-        if not name or f"{dot}{ending}".lower() not in IMAGE_ENDINGS:
+        if not is_image_file(file):
             continue
+        name = file.rpartition(".")[0]
         if name in files:
             raise DataError(f"{folder}: {files[name]} and {file} would have the same labels; remove or rename one")
         files[name] = file

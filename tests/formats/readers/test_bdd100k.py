@@ -350,3 +350,16 @@ def test_pictures_among_the_labels_are_no_images(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "labels" / "train" / "a1.jpg"), np.zeros((9, 9, 3), np.uint8))
     with pytest.raises(DataError, match="no BDD100K images"):
         read_bdd100k(tmp_path)
+
+
+def test_hidden_files_are_passed_over(tmp_path: Path) -> None:
+    raw_bdd.write_images(tmp_path)
+    raw_bdd.write_2018_documents(tmp_path)
+    before = read_bdd100k(tmp_path)
+    for path in [path for path in tmp_path.rglob("*") if path.is_file()]:
+        path.with_name(f"._{path.name}").write_bytes(b"\0\5\26\7")
+    for number in range(400):  # more than are looked at for what is labelled
+        (tmp_path / f"labels/100k/train/._{number}.json").touch()
+    source = read_bdd100k(tmp_path)
+    assert source.found == before.found
+    assert source.names("train") == before.names("train")

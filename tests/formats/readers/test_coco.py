@@ -292,3 +292,10 @@ def test_paths_may_be_of_windows(tmp_path: Path) -> None:
     write(tmp_path / "JPEGImages/one.png")
     write(tmp_path / "labels.json", coco(images=[{**coco()["images"][0], "file_name": r"JPEGImages\one.png"}]))
     assert read_coco(tmp_path).record("train", "one").image == tmp_path / "JPEGImages/one.png"
+
+
+def test_hidden_files_are_passed_over(tmp_path: Path) -> None:
+    write(tmp_path / "one.png")
+    write(tmp_path / "labels.json", coco())
+    (tmp_path / "._labels.json").write_bytes(b"\0\5\26\7")
+    assert read_coco(tmp_path).names("train") == ["one"]

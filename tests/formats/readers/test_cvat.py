@@ -201,3 +201,8 @@ def test_a_project_as_cvat_exports_it(tmp_path: Path) -> None:
         "night": ["one"],
     }
     assert source.record("val", "frame_000000").image == tmp_path / "images/Validation/frame_000000.PNG"
+
+
+def test_hidden_files_are_passed_over(tmp_path: Path) -> None:
+    (tmp_path / "._annotations.xml").write_bytes(b"\0\5\26\7")
+    assert read_shapes(tmp_path, '<box label="car" xtl="1" ytl="2" xbr="9" ybr="7"></box>', LabelMapping()).objects

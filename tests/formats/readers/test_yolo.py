@@ -214,3 +214,12 @@ def test_class_names_that_all_mean_nothing_are_refused(root: Path) -> None:
     with pytest.raises(DataError, match=r"none of its categories \('Car'\) .* --classes FILE"):
         read_yolo(root)
     assert read_yolo(root, LabelMapping(tasks=("detection",))).names("train") == ["a"]
+
+
+def test_hidden_files_are_passed_over(root: Path) -> None:
+    (root / "data.yaml").rename(root / "yard.yaml")
+    for file in ("._yard.yaml", "images/train/._a.jpg", "labels/train/._a.txt"):
+        (root / file).write_bytes(b"\0\5\26\7\xff names")
+    source = read_yolo(root)
+    assert source.names("train") == ["a"]
+    assert source.found == ("train: 1 images", "val: 1 images")

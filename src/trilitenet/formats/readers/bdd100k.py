@@ -29,7 +29,7 @@ from trilitenet.data.rasterise import flatten
 from trilitenet.data.reading import IMAGE_ENDINGS, is_crowd
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel, same_name
 from trilitenet.errors import DataError, brief, few
-from trilitenet.formats.readers.mapping import Labels
+from trilitenet.formats.readers.mapping import Labels, visible
 
 __all__ = ["BDD100K_SPLITS", "BddSource", "parse_labels", "read_bdd100k"]
 
@@ -353,7 +353,7 @@ def _tasks_in(entry: Any) -> set[Task]:
 def _tasks_of_documents(folder: Path) -> frozenset[Task]:
     """Return the tasks that one-an-image files label: those that the first few hundred have labels of."""
     tasks: set[Task] = set()
-    for path in sorted(folder.glob("*.json"))[:_DOCUMENTS_LOOKED_AT]:
+    for path in visible(folder.glob("*.json"))[:_DOCUMENTS_LOOKED_AT]:
         if len(tasks) == len(TASKS):
             break
         try:
@@ -444,7 +444,9 @@ def _survey(root: Path) -> tuple[dict[str, Path], list[Path]]:
         files += [
             path / name
             for name in entries
-            if name.endswith(".json") and ("train" in name or "val" in name or "test" in name)
+            if not name.startswith(".")
+            and name.endswith(".json")
+            and ("train" in name or "val" in name or "test" in name)
         ]
     return folders, files
 
@@ -459,7 +461,7 @@ def _images(folders: dict[str, Path], split: str) -> dict[str, Path]:
         images: dict[str, Path] = {}
         for where, folder in folders.items():
             if re.search(rf"(^|/){pattern}$", where) and "label" not in where:
-                for path in sorted(folder.iterdir()):
+                for path in visible(folder.iterdir()):
                     if path.suffix.lower() in IMAGE_ENDINGS[:2]:
                         first = images.setdefault(path.stem, path)
                         if first.stat().st_size != path.stat().st_size:  # else it is a copy

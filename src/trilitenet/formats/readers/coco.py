@@ -26,7 +26,7 @@ from trilitenet.data.records import (
     named_apart,
 )
 from trilitenet.errors import DataError, brief, few
-from trilitenet.formats.readers.mapping import SPLIT_NAMES, LabelMapping, Labels, find_image, read_json
+from trilitenet.formats.readers.mapping import SPLIT_NAMES, LabelMapping, Labels, find_image, read_json, visible
 
 __all__ = ["read_coco"]
 
@@ -70,7 +70,7 @@ def _annotation_files(root: Path, default: str) -> tuple[list[tuple[Path, str, A
     """Return (file, split, content) of the files to read, and the files that are left out for them."""
     if root.is_file():
         return [(root, default, read_json(root))], []
-    files = sorted({*root.glob("*.json"), *root.glob("annotations/*.json"), *root.glob("*/_annotations.coco.json")})
+    files = visible({*root.glob("*.json"), *root.glob("annotations/*.json"), *root.glob("*/_annotations.coco.json")})
     chosen: list[tuple[Path, str, Any]] = []
     for whole in (True, False):  # COCO's own captions and key points are of the images of instances_*.json
         taken = {split for _, split, _ in chosen}

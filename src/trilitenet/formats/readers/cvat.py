@@ -26,7 +26,7 @@ from trilitenet.data.records import (
     named_apart,
 )
 from trilitenet.errors import DataError, brief
-from trilitenet.formats.readers.mapping import SPLIT_NAMES, LabelMapping, Labels, find_image, hull
+from trilitenet.formats.readers.mapping import SPLIT_NAMES, LabelMapping, Labels, find_image, hull, visible
 
 __all__ = ["read_cvat"]
 
@@ -57,7 +57,7 @@ def read_cvat(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
     """
     mapping = mapping or LabelMapping()
     root = Path(root)
-    files = [root] if root.is_file() else sorted(root.glob("*.xml"))
+    files = [root] if root.is_file() else visible(root.glob("*.xml"))
     if not files:
         raise DataError(f"{root}: no .xml file; export the task from CVAT as 'CVAT for images 1.1'")
     folder = root.parent if root.is_file() else root

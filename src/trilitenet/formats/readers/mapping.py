@@ -7,7 +7,7 @@ import dataclasses
 import itertools
 import re
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -20,7 +20,7 @@ from trilitenet.data.reading import IMAGE_ENDINGS
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ObjectLabel, RunLabel
 from trilitenet.errors import ConfigError, DataError, brief
 
-__all__ = ["SPLIT_NAMES", "LabelMapping", "MaskRule", "parse_colour", "read_mapping"]
+__all__ = ["SPLIT_NAMES", "LabelMapping", "MaskRule", "parse_colour", "read_mapping", "visible"]
 
 SPLIT_NAMES: Final = {
     "train": "train",
@@ -248,6 +248,11 @@ def hull(points: NDArray[np.float64]) -> tuple[float, float, float, float]:
     """Return the left, top, right and bottom of (N, 2) points."""
     (left, top), (right, bottom) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
     return left, top, right, bottom
+
+
+def visible(files: Iterable[Path]) -> list[Path]:
+    """Return files sorted, without hidden ones: macOS puts a ``._labels.json``, which is none, beside each file."""
+    return sorted(path for path in files if not path.name.startswith("."))
 
 
 def find_image(name: str, folders: list[Path]) -> Path | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from trilitenet.config import TASKS
-from trilitenet.data.reading import IMAGE_ENDINGS
+from trilitenet.data.reading import is_image_file
 from trilitenet.data.records import ImageRecord, ListedRecords, MaskFile
 from trilitenet.errors import DataError
 from trilitenet.formats.readers.mapping import LabelMapping, MaskRule
@@ -42,7 +42,7 @@ def read_masks(root: str | Path, mapping: LabelMapping | None = None) -> ListedR
                 lane=_mask(root, mapping.lane_mask, split, path.stem) if "lane" in tasks else None,
             )
             for path in sorted(folder.iterdir())
-            if path.suffix.lower() in IMAGE_ENDINGS
+            if is_image_file(path.name)
         ]
         if items:
             records[split] = items

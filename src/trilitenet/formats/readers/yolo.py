@@ -14,10 +14,10 @@ from typing import Any, Final
 import numpy as np
 
 from trilitenet.config import Task, read_yaml
-from trilitenet.data.reading import IMAGE_ENDINGS
+from trilitenet.data.reading import is_image_file
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ObjectLabel, image_size, name_apart, same_name
 from trilitenet.errors import ConfigError, DataError, brief, few
-from trilitenet.formats.readers.mapping import LabelMapping, Labels, hull
+from trilitenet.formats.readers.mapping import LabelMapping, Labels, hull, visible
 
 __all__ = ["YoloSource", "read_yolo"]
 
@@ -164,7 +164,9 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
     ]
     labels = {_label_path(image): image for items in images.values() for image in items.values()}
     folders = {path.parent for path, image in labels.items() if path.parent != image.parent}
-    stray = {path for folder in folders for path in folder.glob("*.txt") if path.name != "classes.txt"} - labels.keys()
+    stray = {
+        path for folder in folders for path in visible(folder.glob("*.txt")) if path.name != "classes.txt"
+    } - labels.keys()
     if stray:
         found.append(f"{len(stray)} label files are of no image in a split, such as {min(stray)}")
     return YoloSource(path, dict(images), table, mapping, tuple(found), key_points="kpt_shape" in content)
@@ -173,7 +175,7 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
 def _find_yaml(root: Path) -> Path:
     if root.is_file():
         return root
-    for path in [root / "data.yaml", *sorted(root.glob("*.y*ml"))]:
+    for path in [root / "data.yaml", *visible(root.glob("*.y*ml"))]:
         if path.is_file() and "names" in _read_text(path):
             return path
     raise DataError(f"{root}: no data.yaml with 'names'")
@@ -198,7 +200,7 @@ def _images_at(candidates: list[tuple[Path, str]]) -> list[Path]:
     for root, part in candidates:
         folder = root / part
         if folder.is_dir():
-            return sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_ENDINGS)
+            return sorted(path for path in folder.rglob("*") if is_image_file(path.name))
         if folder.suffix == ".txt" and folder.is_file():
             return [root / line.strip() for line in _read_text(folder).splitlines() if line.strip()]
     return []
