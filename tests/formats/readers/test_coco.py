@@ -195,6 +195,16 @@ def test_annotations_that_are_all_of_no_image_are_refused(tmp_path: Path) -> Non
         read_coco(tmp_path)
 
 
+def test_annotations_that_are_all_of_no_category_are_refused(tmp_path: Path) -> None:
+    write(tmp_path / "one.png")
+    annotations = [{**item, "category_id": str(item["category_id"])} for item in coco()["annotations"]]
+    write(tmp_path / "labels.json", coco(annotations=annotations))
+    with pytest.raises(DataError, match=r"id of a category \(category_id '1', but categories 1, 2, 3\); write both"):
+        read_coco(tmp_path)
+    write(tmp_path / "labels.json", coco(annotations=[*annotations, coco()["annotations"][0]]))
+    assert len(read_coco(tmp_path).record("train", "one").objects or ()) == 6  # of which all but one are told
+
+
 def test_a_split_without_images_is_left_out(tmp_path: Path) -> None:
     write(tmp_path / "train/one.png")
     for split in ("train", "val"):

@@ -127,6 +127,12 @@ def _read_file(
                 f"{path}: no annotation has the id of an image (image_id {min(map(repr, stray))}, but images "
                 f"{content['images'][0]['id']!r}, ...); {cure}"
             )
+        told = {item.get("category_id") for item in content["annotations"]}
+        if names and told and told.isdisjoint(names):
+            raise DataError(
+                f"{path}: no annotation has the id of a category (category_id {min(map(repr, told))}, but categories "
+                f"{few([repr(name) for name in names])}); write both alike, as numbers or as text"
+            )
         tasks = mapping.labelled(set(names.values()))
         categories.update(names.values())
         folders = [path.parent]
