@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from trilitenet.apps.cli import COMMANDS, build_app
+from trilitenet.apps.cli import COMMANDS, _repeated, build_app
 
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
@@ -25,7 +25,7 @@ def blocks(page: Path, language: str) -> list[str]:
 def lines(page: Path) -> list[str]:
     """Return the commands of a page, continued lines joined and comments gone."""
     text = "\n".join(block.replace("\\\n", " ") for block in blocks(page, "bash"))
-    commands = (" ".join(shlex.split(line, comments=True, posix=True)) for line in text.splitlines())
+    commands = (shlex.join(shlex.split(line, comments=True)) for line in text.splitlines())
     return [command for command in commands if command]
 
 
@@ -43,7 +43,7 @@ def test_commands_parse(line: str) -> None:
     words = shlex.split(line)[1:]
     if "--help" in words or "COMMAND" in words:
         return
-    build_app(words).parse_args(words, print_error=False, exit_on_error=False)
+    build_app(words).parse_args(_repeated(words), print_error=False, exit_on_error=False)
 
 
 @pytest.mark.parametrize("line", commands_of("make"))
