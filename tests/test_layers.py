@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import shutil
 import subprocess
 import sys
@@ -37,6 +38,13 @@ def imported(path: Path) -> set[str]:
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
 def test_no_file_imports_what_is_banned(path: Path) -> None:
     assert not imported(path) & {"torchvision", "ultralytics"}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
+def test_a_logger_of_a_module_has_one_name_and_is_used(path: Path) -> None:
+    names = re.findall(r"^(\w+)(?:: Final)? = logging\.getLogger\(", path.read_text(encoding="utf-8"), re.MULTILINE)
+    assert names in ([], ["_LOGGER"])
+    assert not names or "_LOGGER." in path.read_text(encoding="utf-8")
 
 
 def test_no_folder_is_a_drawer_for_anything() -> None:

@@ -62,7 +62,7 @@ from trilitenet.processing.images import BROKEN
 
 __all__ = ["ConversionOptions", "ConversionReport", "convert", "drivable_mask", "lane_mask"]
 
-_logger = logging.getLogger(__name__)
+_LOGGER: Final = logging.getLogger(__name__)
 
 REFERENCE_WIDTH: Final = 1280
 """Line widths and gaps are in pixels of an image this wide."""
@@ -332,7 +332,7 @@ class _Job:
             summary = {**_convert_one(record, self.split, self.root, self.options), "digest": digest}
         except DataError as error:
             readable = name.encode("utf-8", "backslashreplace").decode()  # a file's name may be no text
-            _logger.warning("left out %s/%s: %s", self.split, readable, error)
+            _LOGGER.warning("left out %s/%s: %s", self.split, readable, error)
             summary = {"name": name, "dropped": {"image: labels or image broken": 1}, "error": str(error)}
         _remove_files(self.root, self.split, name, keep=_files(self.split, summary))
         return summary

@@ -53,7 +53,7 @@ from trilitenet.processing.letterbox import Letterbox
 
 __all__ = ["PreparedDataset", "is_prepared", "open_dataset", "prepare", "shrink"]
 
-_logger = logging.getLogger(__name__)
+_LOGGER: Final = logging.getLogger(__name__)
 
 CACHE_FOLDER: Final = ".prepared"
 """A prepared copy in this folder of a data set is used by itself."""
@@ -223,21 +223,21 @@ def open_dataset(
                 f"or set augmentation.mask_above to {prepared.mask_above}"
             )
         if canvas is not None and prepared.canvas != canvas:
-            _logger.warning("%s: prepared for %s, used at %s", root, prepared.canvas, canvas)
+            _LOGGER.warning("%s: prepared for %s, used at %s", root, prepared.canvas, canvas)
         return prepared
     cache = root / CACHE_FOLDER
     if canvas is not None and classes is None and is_prepared(cache):
         state = _read_state(cache)
         wanted = list(class_names or read_description(root).class_names)
         if state["canvas"] != list(canvas) or state["class_names"] != wanted or split not in state["splits"]:
-            _logger.info("%s: the prepared copy is for something else and is not used", root)
+            _LOGGER.info("%s: the prepared copy is for something else and is not used", root)
         elif mask_above not in (None, state["mask_above"]):
-            _logger.warning(
+            _LOGGER.warning(
                 "%s: prepared with --mask-above %d and not used, as %d is wanted; prepare it with that",
                 cache, state["mask_above"], mask_above,
             )  # fmt: skip
         elif state["splits"][split] != _fingerprint(root, split):
-            _logger.warning("%s: changed since it was prepared; run `trilitenet data prepare` again", root)
+            _LOGGER.warning("%s: changed since it was prepared; run `trilitenet data prepare` again", root)
         else:
             return PreparedDataset(cache, split, tasks=tasks)
     return DrivingDataset(root, split, class_names=class_names, classes=classes, tasks=tasks)

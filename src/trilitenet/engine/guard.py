@@ -13,7 +13,7 @@ from trilitenet.errors import TrainingError
 
 __all__ = ["MAX_BAD_STEPS", "FiniteGuard"]
 
-log = logging.getLogger(__name__)
+_LOGGER: Final = logging.getLogger(__name__)
 
 MAX_BAD_STEPS: Final = 10
 """So many steps in a row without a finite loss and gradient end the run."""
@@ -73,7 +73,7 @@ class FiniteGuard:
             any_bad = True
             self.bad_steps += 1
             shown = ", ".join(names)
-            log.warning("step %d skipped: its loss or gradient is not finite (images: %s)", step, shown)
+            _LOGGER.warning("step %d skipped: its loss or gradient is not finite (images: %s)", step, shown)
             if self.bad_steps >= MAX_BAD_STEPS:
                 raise TrainingError(
                     f"loss or gradient not finite for {MAX_BAD_STEPS} steps in a row, the last being step {step} "

@@ -23,7 +23,7 @@ from trilitenet.processing.memory import STEPS, keep_freed_memory
 
 __all__ = ["StopRequest", "follow", "pick_precision", "putting_off", "running_fabric"]
 
-log = logging.getLogger(__name__)
+_LOGGER: Final = logging.getLogger(__name__)
 
 _PATIENCE: Final = datetime.timedelta(days=1)
 """Processes wait so long for each other."""
@@ -151,7 +151,7 @@ def _build_fabric(device: str, precision: str, devices: int, num_nodes: int) -> 
     except (ValueError, TypeError, ImportError) as error:  # the last of a device whose package is not here
         raise ConfigError(f"device {device!r} with precision {precision!r}: {error}") from error
     if _emulates(picked, accelerator) and fabric.global_rank == 0:
-        log.warning("this processor has no instructions for bf16: --precision 32-true is faster")
+        _LOGGER.warning("this processor has no instructions for bf16: --precision 32-true is faster")
     return fabric
 
 
@@ -211,7 +211,7 @@ class _Others:
         """End this process if another has failed and this one waits for it and does not notice, as on a GPU."""
         while not self._over.wait(1.0):
             if any(process.poll() for process in self._processes) and not self._over.wait(_GRACE):
-                log.error("%s", self.reason())
+                _LOGGER.error("%s", self.reason())
                 self.end()
                 os._exit(1)
 
@@ -301,7 +301,7 @@ class StopRequest:
         if self.signal is not None and number == signal.SIGINT:
             raise KeyboardInterrupt
         self.signal = number
-        log.warning("%s: stopping after this step, with a checkpoint", signal.Signals(number).name)
+        _LOGGER.warning("%s: stopping after this step, with a checkpoint", signal.Signals(number).name)
 
 
 @contextlib.contextmanager

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-import logging
 import math
 import shutil
 import time
@@ -47,7 +46,6 @@ from trilitenet.models.weights import read_card, save_network
 
 __all__ = ["CHECKPOINT_NAME", "FIGURES", "TrainResult", "Trainer", "holds_run"]
 
-log = logging.getLogger(__name__)
 
 CHECKPOINT_NAME: Final = "last.ckpt"
 """The checkpoint in the run's folder that `--resume` continues from."""

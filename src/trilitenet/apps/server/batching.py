@@ -14,7 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from trilitenet.structures import RawOutputs
 
 __all__ = ["Admission", "Batcher", "split"]
 
-logger = logging.getLogger(__name__)
+_LOGGER: Final = logging.getLogger(__name__)
 
 
 class Admission:
@@ -231,7 +231,7 @@ class Batcher:
             raw = self._run(np.stack([item.canvas for item in batch]))
             pieces = split(raw, len(batch))
         except Exception as error:  # the service must outlive a backend that fails on one batch
-            logger.exception("the backend failed on a batch of %d", len(batch))
+            _LOGGER.exception("the backend failed on a batch of %d", len(batch))
             for item in batch:
                 item.future.set_exception(error)
             return

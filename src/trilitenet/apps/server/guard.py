@@ -22,7 +22,7 @@ from trilitenet.apps.server.service import Service
 
 __all__ = ["PUBLIC_PATHS", "Guard"]
 
-logger = logging.getLogger("trilitenet.server")
+_LOGGER: Final = logging.getLogger("trilitenet.server")
 
 PUBLIC_PATHS: Final = PAGE_PATHS | {"/healthz", "/readyz"}
 """What needs no token: the page's own files, which hold nothing secret, and the probes."""
@@ -83,7 +83,7 @@ class Guard:
                 await self._app(scope, exchange.receive, exchange.send)
         except Exception:
             # The application has answered 500 by now, if anything could still be sent.
-            logger.exception("unexpected error", extra={"request_id": exchange.identifier})
+            _LOGGER.exception("unexpected error", extra={"request_id": exchange.identifier})
             if not exchange.started:
                 raise
         finally:
@@ -207,7 +207,7 @@ class _Exchange:
             self._service.metrics.vanish()
         elif problem is not None:
             self._service.metrics.reject(problem)
-        logger.info(
+        _LOGGER.info(
             "request",
             extra={
                 "request_id": self.identifier,

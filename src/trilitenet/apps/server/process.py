@@ -23,7 +23,7 @@ from trilitenet.apps.server.settings import Settings
 
 __all__ = ["GuardedProtocol", "GuardedServer", "JsonFormatter", "build_server", "set_up_logs"]
 
-logger = logging.getLogger("trilitenet.server")
+_LOGGER: Final = logging.getLogger("trilitenet.server")
 
 _MAX_HEADERS: Final = 32 * 1024
 """Bytes of a request's first line and headers."""
@@ -239,7 +239,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._cancel()
         self._refused = True
         self.metrics.reject(code)
-        logger.info("connection refused", extra={"status": status, "problem": code})
+        _LOGGER.info("connection refused", extra={"status": status, "problem": code})
         if self.cycle is not None and not self.cycle.response_complete:
             if self._in_headers or self.pipeline or self.cycle.response_started:
                 self._close()  # an answer to an earlier request is on its way
@@ -283,7 +283,7 @@ class GuardedServer(uvicorn.Server):
         await super().startup(sockets)
         for listener in sockets or []:
             host, port = listener.getsockname()[:2]
-            logger.info("listening", extra={"url": f"http://{f'[{host}]' if ':' in host else host}:{port}/"})
+            _LOGGER.info("listening", extra={"url": f"http://{f'[{host}]' if ':' in host else host}:{port}/"})
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Drain, then stop."""

@@ -10,7 +10,6 @@ import asyncio
 import dataclasses
 import functools
 import io
-import logging
 import math
 import time
 from collections.abc import Awaitable, Callable, Iterator, Sequence
@@ -34,7 +33,6 @@ from trilitenet.structures import Perception, RawOutputs
 
 __all__ = ["Encoded", "Outcome", "Service", "in_time"]
 
-logger = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
 _PATIENCE: Final = 0.6
