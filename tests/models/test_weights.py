@@ -83,6 +83,14 @@ def test_what_is_saved_is_what_the_network_is(tmp_path: Path) -> None:
     assert not [name for name in names if name == "anchors" or name.endswith("num_batches_tracked")]
 
 
+def test_the_same_weights_make_the_same_file(tmp_path: Path, saved: Path) -> None:
+    network = load_network(saved)
+    again = tmp_path / "again.safetensors"
+    for _ in range(10):
+        save_network(network, again, network.card)
+        assert again.read_bytes() == saved.read_bytes()
+
+
 def test_half_precision_halves_the_file(tmp_path: Path) -> None:
     network = build_network("tiny")
     save_network(network, tmp_path / "full.safetensors", network.card)

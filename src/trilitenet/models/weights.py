@@ -141,7 +141,7 @@ def save_network(network: TriLiteNet, path: str | os.PathLike[str], card: ModelC
                 f"{path}: not written, {name} holds values that are not finite{' in fp16' if half else ''}"
             )
         tensors[name] = data
-    metadata = {CARD_KEY: card.to_json(), "format": "pt"}
+    metadata = {CARD_KEY: card.to_json()}  # a second entry would come before or after it by chance
     if foreign := foreign_layers(network):
         metadata[_FOREIGN_KEY] = ", ".join(foreign)
     try:
