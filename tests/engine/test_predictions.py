@@ -47,6 +47,20 @@ def test_what_is_written_is_read_again(tmp_path: Path, rng: np.random.Generator)
         np.testing.assert_array_equal(again.lane, one.lane)
 
 
+def test_classes_in_another_order_are_refused(tmp_path: Path, rng: np.random.Generator) -> None:
+    with PredictionWriter(tmp_path, ("detection",)) as writer:
+        writer.write("a", perception(rng, 3))
+    for names in (("bus", "car"), ("car", "bus", "lorry")):
+        with pytest.raises(DataError, match=r"classes\.json: .* car, bus, not .*; give --classes car bus$"):
+            SavedPredictions(tmp_path, names)
+    assert SavedPredictions(tmp_path, ("vehicle",)).names == {"a"}
+    (tmp_path / "classes.json").write_text("3")
+    with pytest.raises(DataError, match=r"classes\.json: not a JSON list of names"):
+        SavedPredictions(tmp_path, ("car", "bus"))
+    PredictionWriter(tmp_path, ("detection",), overwrite=True).close()
+    assert SavedPredictions(tmp_path, ("bus", "car")).tasks == ("detection",)
+
+
 def test_the_form_on_disk(tmp_path: Path) -> None:
     one = Perception(
         (2, 3),

@@ -3,6 +3,8 @@
     DIR/detections.json      COCO results: image_id = name of the image without ending, bbox = [left, top, width,
                              height] in pixels of the image as stored, score in [0, 1], category_id = 1, 2, ... in the
                              order of the classes (with one class: anything)
+    DIR/classes.json         names of the classes in that order, ["car", "bus"]: may be left out; where it is there,
+                             predictions of several classes are read with these alone
     DIR/drivable/NAME.png    above 0 = drivable, same size as the image
     DIR/lane/NAME.png        above 0 = lane marking, same size as the image
 
@@ -18,6 +20,7 @@ import json
 import logging
 import math
 import re
+import shlex
 import shutil
 from collections.abc import Iterator, Sequence, Set
 from pathlib import Path
@@ -30,7 +33,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import TASKS, Task
 from trilitenet.data.reading import decode
-from trilitenet.errors import DataError, OutputError, brief, part_of, writing
+from trilitenet.errors import DataError, OutputError, brief, part_of, write_file, writing
 from trilitenet.structures import Boxes, Perception
 
 __all__ = ["DETECTIONS_FILE", "PredictionWriter", "SavedPredictions"]
@@ -38,6 +41,7 @@ __all__ = ["DETECTIONS_FILE", "PredictionWriter", "SavedPredictions"]
 _LOGGER: Final = logging.getLogger(__name__)
 
 DETECTIONS_FILE: Final = "detections.json"
+_CLASSES_FILE: Final = "classes.json"
 
 
 class PredictionWriter:
@@ -55,6 +59,7 @@ class PredictionWriter:
     def __init__(self, folder: Path, tasks: Sequence[Task], *, overwrite: bool = False) -> None:
         self.folder = folder
         self._tasks = tuple(tasks)
+        self._class_names: tuple[str, ...] = ()
         self._file: IO[str] | None = None
         self._first = True
         held = [name for name in (DETECTIONS_FILE, "drivable", "lane") if (folder / name).exists()]
@@ -63,7 +68,8 @@ class PredictionWriter:
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
             # Another model's predictions would be taken for this one's.
-            (folder / DETECTIONS_FILE).unlink(missing_ok=True)
+            for name in (DETECTIONS_FILE, _CLASSES_FILE):
+                (folder / name).unlink(missing_ok=True)
             for name in ("drivable", "lane"):
                 if (folder / name).is_dir():
                     shutil.rmtree(folder / name)
@@ -96,6 +102,7 @@ class PredictionWriter:
         """
         if self._file is not None and prediction.boxes is not None:
             boxes = prediction.boxes
+            self._class_names = prediction.class_names
             for box, score, number in zip(boxes.xyxy, boxes.confidence, boxes.class_id, strict=True):
                 left, top, right, bottom = (float(value) for value in box)
                 entry = {
@@ -116,13 +123,17 @@ class PredictionWriter:
                     path.write_bytes(bytes(np.asarray(encoded, np.uint8)))
 
     def close(self) -> None:
-        """Finish ``detections.json``, which has its name from then on. Calling it twice is harmless.
+        """Name the classes and finish ``detections.json``, which has its name from then on.
+
+        Calling it twice is harmless.
 
         Raises:
             OutputError: If it cannot be written.
         """
         if self._file is not None:
             path = self.folder / DETECTIONS_FILE
+            if self._class_names:
+                write_file(self.folder / _CLASSES_FILE, json.dumps(self._class_names))
             with writing(path):
                 with self._file as file:
                     self._file = None
@@ -138,7 +149,7 @@ class SavedPredictions:
         class_names: Detection classes, category 1 first.
 
     Raises:
-        DataError: If there is nothing in the folder, or ``detections.json`` has another form.
+        DataError: If there is nothing in the folder, a file has another form, or the boxes are of other classes.
     """
 
     def __init__(self, folder: Path, class_names: Sequence[str]) -> None:
@@ -154,6 +165,7 @@ class SavedPredictions:
             raise DataError(f"{folder}: no predictions; expected {DETECTIONS_FILE}, drivable/NAME.png or lane/NAME.png")
         self._boxes: dict[str, Boxes] = {}
         if present["detection"]:
+            self._check_classes(folder / _CLASSES_FILE)
             self._boxes = self._read_detections(folder / DETECTIONS_FILE)
 
     @property
@@ -193,6 +205,24 @@ class SavedPredictions:
             raise DataError(f"{path}: {grey.shape[1]}x{grey.shape[0]}, the image is {size[1]}x{size[0]}")
         mask: NDArray[np.bool_] = grey > 0
         return mask
+
+    def _check_classes(self, path: Path) -> None:
+        """Refuse classes that the numbers do not stand for; with one, all boxes count as of it.
+
+        Raises:
+            DataError: If they are others or in another order, or the file has another form.
+        """
+        if len(self.class_names) == 1 or not path.is_file():
+            return
+        try:
+            names = tuple(map(str, json.loads(path.read_bytes())))
+        except (TypeError, ValueError, RecursionError) as error:
+            raise DataError(f"{path}: not a JSON list of names: {brief(error)}") from error
+        if names != self.class_names:
+            raise DataError(
+                f"{path}: the boxes are of the classes {', '.join(names)}, not {', '.join(self.class_names)}; give "
+                f"--classes {shlex.join(names)}"
+            )
 
     def _read_detections(self, path: Path) -> dict[str, Boxes]:
         numbers = array.array("d")  # an entry: image, left, top, right, bottom, score, class
