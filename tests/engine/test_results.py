@@ -27,6 +27,7 @@ def test_page_shows_curves_facts_and_pictures(tmp_path: Path) -> None:
     )
     text = page.read_text()
     assert "A &lt;run&gt;" in text
+    assert '<meta name="viewport"' in text  # else a phone shows it as small as a desktop's
     assert "road &amp; sky" in text
     for name in ("losses.png", "metrics.png", "learning-rate.png", "labels-0.jpg", "prediction-0.jpg"):
         assert name in text

@@ -79,7 +79,9 @@ def write_results(
     page = folder / "index.html"
     write_file(
         page,
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
+        '<!doctype html><html lang="en"><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{html.escape(title)}</title>"
         f"<style>{_STYLE}</style><h1>{html.escape(title)}</h1><table>{rows}</table>{''.join(figures)}"
         f"{'<h2>Labels and predictions</h2>' if pairs else ''}{''.join(pairs)}</html>\n",
     )
