@@ -75,6 +75,20 @@ def test_a_disk_that_tensorboard_finds_full_is_told_by_the_next_call_alone(
     assert threading.excepthook is hook
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_tensorboard_takes_back_its_own_hook_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("tensorboard")
+
+    def other(_: object) -> None:
+        """Stand for what a tool that collects errors sets while a run is under way."""
+
+    monkeypatch.setattr(threading, "excepthook", threading.excepthook)  # put back at the end
+    (logger,) = build_loggers(["tensorboard"], tmp_path, {})
+    threading.excepthook = other
+    logger.close()
+    assert threading.excepthook is other
+
+
 @pytest.mark.parametrize("name", ["mlflow", "wandb"])
 def test_a_missing_package_names_its_extra(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, name, None)

@@ -94,7 +94,8 @@ class TensorBoardLogger:
         try:
             self._writer.close()
         finally:
-            threading.excepthook = self._hook
+            if threading.excepthook == self._note:  # another's that came later stays
+                threading.excepthook = self._hook
 
     def _note(self, failure: threading.ExceptHookArgs) -> None:
         """Say nothing of what ends TensorBoard's thread, such as a full disk: the next call raises it."""
