@@ -24,6 +24,17 @@ def test_csv_goes_on_without_what_came_after(tmp_path: Path) -> None:
     assert read_csv(path) == [(1, "loss", 1 / 3), (2, "loss", 2 / 3), (3, "loss", 9.0)]
 
 
+def test_csv_goes_on_without_a_validation_that_is_done_anew(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.csv"
+    figures = {"train/total": 0.5, "val/lane/iou": 0.1}
+    logger = CsvLogger(path)
+    logger.log(figures, 2)
+    logger.log(figures, 4)
+    logger.close()
+    CsvLogger(path, step=4, validated=2).close()
+    assert read_csv(path) == [(2, "train/total", 0.5), (2, "val/lane/iou", 0.1), (4, "train/total", 0.5)]
+
+
 def test_a_line_that_was_cut_off_is_left_out(tmp_path: Path) -> None:
     path = tmp_path / "metrics.csv"
     for end in (b"8,val/lan", b"8", b"8,val/lane,0.", b"8,val/lane,x\n", b"8,val/lan\xff"):

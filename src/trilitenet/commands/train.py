@@ -154,7 +154,7 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
         )
         result = trainer.fit(
             folder / CHECKPOINT_NAME if resume else None,
-            lambda step: build_loggers(config.loggers, folder, config.to_dict(), step),
+            lambda *steps: build_loggers(config.loggers, folder, config.to_dict(), *steps),
         )
         if fabric.is_global_zero and result.finished and "csv" in config.loggers:
             predictor = Predictor(TorchBackend(trainer.averaged, device))

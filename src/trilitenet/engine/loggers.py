@@ -38,15 +38,16 @@ class CsvLogger:
     Args:
         path: The file.
         step: Step the run goes on from; 0 starts the file anew.
+        validated: Step of the last validation that the run does not do anew.
     """
 
-    def __init__(self, path: Path, step: int = 0) -> None:
+    def __init__(self, path: Path, step: int = 0, validated: int = 0) -> None:
         rows = read_csv(path) if step and path.exists() else []
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as part, part.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(("step", "name", "value"))
-            writer.writerows(row for row in rows if row[0] <= step)
+            writer.writerows(row for row in rows if row[0] <= (validated if row[1].startswith("val/") else step))
         self._file = path.open("a", newline="", encoding="utf-8")
         self._writer = csv.writer(self._file)
 
@@ -155,7 +156,9 @@ def check_loggers(names: Sequence[str]) -> None:
             import_extra(*_PACKAGES[name])
 
 
-def build_loggers(names: Sequence[str], folder: Path, config: Mapping[str, Any], step: int = 0) -> list[RunLogger]:
+def build_loggers(
+    names: Sequence[str], folder: Path, config: Mapping[str, Any], step: int = 0, validated: int = 0
+) -> list[RunLogger]:
     """Build loggers by name.
 
     Args:
@@ -163,6 +166,7 @@ def build_loggers(names: Sequence[str], folder: Path, config: Mapping[str, Any],
         folder: The run's folder.
         config: The resolved configuration.
         step: Step the run goes on from.
+        validated: Step of the last validation that it does not do anew.
 
     Raises:
         MissingExtraError: If a logger's package is not installed.
@@ -170,7 +174,7 @@ def build_loggers(names: Sequence[str], folder: Path, config: Mapping[str, Any],
     loggers: list[RunLogger] = []
     for name in dict.fromkeys(names):
         if name == "csv":
-            loggers.append(CsvLogger(folder / "metrics.csv", step))
+            loggers.append(CsvLogger(folder / "metrics.csv", step, validated))
         elif name == "tensorboard":
             loggers.append(TensorBoardLogger(folder / "tensorboard", step))
         elif name == "mlflow":

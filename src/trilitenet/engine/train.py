@@ -246,13 +246,14 @@ class Trainer:
     def fit(
         self,
         resume: str | Path | None = None,
-        build_loggers: Callable[[int], Sequence[RunLogger]] = lambda step: (),
+        build_loggers: Callable[[int, int], Sequence[RunLogger]] = lambda step, validated: (),
     ) -> TrainResult:
         """Train to the end, or until SIGINT or SIGTERM asks to stop.
 
         Args:
             resume: A checkpoint to go on from.
-            build_loggers: Returns the loggers of a run that goes on from a step.
+            build_loggers: Returns the loggers of a run that goes on from a step, the last validation that it will not
+                do anew being of another one.
 
         Raises:
             DataError: If an image or label cannot be read.
@@ -271,7 +272,7 @@ class Trainer:
                 if resume is None:
                     _forget(self.folder)
                 write_file(self.folder / "config.yaml", yaml.safe_dump(self.config.to_dict(), sort_keys=False))
-                self.loggers = build_loggers(self.step)
+                self.loggers = build_loggers(self.step, self.ended)
         weights = self.folder / "final.safetensors"
         try:
             with self._logging():
@@ -430,16 +431,20 @@ class Trainer:
     def _end_epoch(self, epoch: int, stop: StopRequest) -> None:
         """Validate, keep the best, save, but at the end of the run, which does that itself.
 
-        A validation is left if a wish to stop comes meanwhile; a run that goes on does it anew.
+        A validation is left if a wish to stop comes meanwhile; a run that goes on does it anew, and that alone: the
+        state is saved before, too.
         """
         last = self.step >= self.steps
+        saved = last or (epoch + 1) % self.config.checkpoint_every == 0
         if self.validate is not None and (last or (epoch + 1) % self.config.validate_every == 0):
+            if saved and self._saved != self.step:
+                self.save()
             whole = self.fabric.is_global_zero and self._validate(epoch, stop)
             whole, self.stale = self.fabric.broadcast((whole, self.stale))
             if not whole:
                 return
         self.ended = self.step
-        if not last and (epoch + 1) % self.config.checkpoint_every == 0:
+        if saved and not last:
             self.save()
 
     def _validate(self, epoch: int, stop: StopRequest) -> bool:
