@@ -179,6 +179,16 @@ def test_resuming_takes_the_new_weight_decay(scenes: Path, begun: Path) -> None:
     assert {tuple(group["betas"]) for group in groups} == {(0.5, 0.6)}
 
 
+def test_settings_that_are_others_on_resuming_are_told(
+    scenes: Path, begun: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train(resume=True, **settings(scenes, begun, max_steps=1))
+    assert "other settings" not in capsys.readouterr().err
+    train(resume=True, **settings(scenes, begun, max_steps=1, lr=0.5, augmentation__flip=0.0))
+    told = "goes on with other settings than it had: augmentation.flip 0.0 (was 0.5), lr 0.5 (was 0.001)\n"
+    assert told in capsys.readouterr().err
+
+
 def test_what_has_no_effect_is_told(scenes: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     data = shutil.copytree(scenes, tmp_path / "data")
     shutil.rmtree(data / "ll_seg_annotations" / "train")

@@ -597,6 +597,9 @@ class Trainer:
         self._saved = self.step
         self._read_best()
         self.guard.look()
+        other = ", ".join(_changes(theirs, ours))
+        if other:
+            self._show(f"goes on with other settings than it had: {other}")
 
     def _take_over(self, state: Mapping[str, Any]) -> None:
         self.network.load_state_dict(state["network"])
@@ -628,6 +631,16 @@ class Trainer:
             value = read_card(path).metrics.get(f"best {name}", -math.inf)
             if value > self.best.get(name, -math.inf):
                 self._ahead[name] = value
+
+
+def _changes(before: Mapping[str, Any], after: Mapping[str, Any], within: str = "") -> Iterator[str]:
+    """Tell every setting that has another value, but the places of data and run, which may have been moved."""
+    for name, value in after.items():
+        old = before.get(name, value)
+        if isinstance(old, Mapping) and old.keys() == value.keys():
+            yield from _changes(old, value, f"{within}{name}.")
+        elif old != value and name not in ("data", "output"):
+            yield f"{within}{name} {value} (was {old})"
 
 
 def holds_run(folder: Path) -> bool:
