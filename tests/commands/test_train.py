@@ -542,6 +542,16 @@ def test_stops_early(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert result.steps == 6  # one good validation and two no better, two steps an epoch
 
 
+def test_a_validation_without_labels_is_told_and_stops_nothing(
+    scenes: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    data = shutil.copytree(scenes, tmp_path / "data")
+    shutil.rmtree(data / "ll_seg_annotations" / "val")
+    options = settings(data, tmp_path / "run", val_split="val", tasks=("lane",), patience=1, max_steps=4, pictures=0)
+    assert train(**options).steps == 4  # two steps an epoch
+    assert "no image of val is labelled for lane" in caplog.text
+
+
 def test_transfer_freeze_and_distil(scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = train(**settings(scenes, tmp_path / "teacher", max_steps=1))
     options = {"init": str(first.weights), "teacher": str(first.weights), "freeze": ("encoder",)}

@@ -11,7 +11,7 @@ import logging
 import math
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, get_type_hints
 
@@ -134,6 +134,9 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
         validation = None
         if config.val_split:
             validation = DrivingDataset(config.data, config.val_split, class_names=network.card.class_names)
+            reason, tasks = _unlabelled(config, config.val_split, [validation])
+            if tasks:
+                _LOGGER.warning(reason)
         device = str(fabric.device)
 
         def validate(network: TriLiteNet, progress: Callable[[int, int], None]) -> dict[str, float]:
@@ -210,11 +213,10 @@ def _check_labels(config: TrainConfig, dataset: SampleSource, display: _Display)
     """
     parts = list(parts_of(dataset))
     if config.teacher is None:
-        without = [task for task in config.tasks if not any(part.has_labels(task) for part in parts)]
-        reason = f"{config.data}: no image of {config.train_split} is labelled for {', '.join(without)}"
-        if set(without) == set(config.tasks):
+        reason, tasks = _unlabelled(config, config.train_split, parts)
+        if tasks == len(config.tasks):
             raise DataError(reason)
-        if without:
+        if tasks:
             _LOGGER.warning(reason)
     if "detection" in config.tasks:
         for part in parts:
@@ -227,6 +229,12 @@ def _check_labels(config: TrainConfig, dataset: SampleSource, display: _Display)
                         few(others, most=10),
                         config.data,
                     )
+
+
+def _unlabelled(config: TrainConfig, split: str, parts: Sequence[DrivingDataset | PreparedDataset]) -> tuple[str, int]:
+    """Return which tasks no image of a split is labelled for, in words, and how many they are."""
+    without = [task for task in config.tasks if not any(part.has_labels(task) for part in parts)]
+    return f"{config.data}: no image of {split} is labelled for {', '.join(without)}", len(without)
 
 
 def _transform(config: TrainConfig, dataset: SampleSource, display: _Display) -> Transform:

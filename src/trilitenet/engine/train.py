@@ -481,7 +481,8 @@ class Trainer:
                 card = dataclasses.replace(card, metrics={**card.metrics, f"best {name}": value})
                 save_network(self.averaged, self._best_path(name), card)
         self.best |= better  # not before the files are whole: after a full disk all of this is done anew
-        self.stale = 0 if "overall" in better else self.stale + 1
+        if scores:  # without labels nothing tells whether it is better
+            self.stale = 0 if "overall" in better else self.stale + 1
 
     def _best_path(self, name: str) -> Path:
         return self.folder / f"best-{name}.safetensors"
