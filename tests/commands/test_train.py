@@ -189,6 +189,14 @@ def test_settings_that_are_others_on_resuming_are_told(
     assert told in capsys.readouterr().err
 
 
+def test_a_run_that_goes_on_without_validation_claims_no_figures(
+    scenes: Path, tmp_path: Path, straight: TrainResult
+) -> None:
+    run = shutil.copytree(straight.folder, tmp_path / "run")
+    result = train(resume=True, **settings(scenes, run, max_steps=5))
+    assert (result.steps, result.metrics, read_card(result.weights).metrics) == (5, {}, {})
+
+
 def test_what_has_no_effect_is_told(scenes: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     data = shutil.copytree(scenes, tmp_path / "data")
     shutil.rmtree(data / "ll_seg_annotations" / "train")

@@ -620,7 +620,8 @@ class Trainer:
             self.fabric._precision.load_state_dict(state["scaler"])
         self.step, self.stale = int(state["step"]), int(state.get("stale", 0))
         self.ended = int(state.get("ended", self.step))
-        self.best, self.metrics = dict(state["best"]), dict(state["metrics"])
+        self.best = dict(state["best"])
+        self.metrics = {} if self.validate is None else dict(state["metrics"])  # else those of other weights at the end
         set_random_state(state["random"])
 
     def _read_best(self) -> None:
