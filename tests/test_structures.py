@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -40,6 +42,8 @@ def test_a_number_is_no_list_of_boxes() -> None:
         ("detection", np.zeros((2, 6), np.float32)),
         ("drivable", np.zeros((1, 4, 4), np.float32)),
         ("lane", np.zeros((4, 4), np.uint8)),
+        ("lane", [[[0]]]),
+        ("detection", [[[0.0] * 6]]),
     ],
 )
 def test_outputs_of_another_form_are_refused(field: str, value: np.ndarray) -> None:
@@ -47,3 +51,19 @@ def test_outputs_of_another_form_are_refused(field: str, value: np.ndarray) -> N
     with pytest.raises(ShapeError, match=f"{field} must be"):
         RawOutputs(**outputs)
     RawOutputs(np.zeros((1, 0, 6), np.float32), None, None)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "got"),
+    [
+        ("drivable", [[True, False]], r"must be \(1, 2\) bool, got no array but a list"),
+        ("lane", np.zeros((1, 2), np.uint8), r"must be \(1, 2\) bool, got \(1, 2\) uint8"),
+        ("lane", np.zeros((2, 1), bool), r"must be \(1, 2\) bool, got \(2, 1\) bool"),
+        ("image", [[[0, 0, 0]] * 2], r"must be \(1, 2, 3\), got no array but a list"),
+        ("boxes", [[0, 0, 1, 1]], "must be Boxes, got a list"),
+    ],
+)
+def test_a_perception_of_other_things_is_refused(field: str, value: Any, got: str) -> None:
+    with pytest.raises(ShapeError, match=f"{field} {got}"):
+        Perception((1, 2), **{field: value})
+    Perception([1, 2], drivable=np.zeros((1, 2), bool))  # type: ignore[arg-type]

@@ -20,6 +20,10 @@ SCHEMA_VERSION: Final = "1.0"
 """Version of the JSON that `Perception.to_dict` returns: the major number rises when a reader would break."""
 
 
+def _told(value: object) -> str:
+    return f"{value.shape} {value.dtype}" if isinstance(value, np.ndarray) else f"no array but a {type(value).__name__}"
+
+
 _BOX_ARRAYS: Final = {"xyxy": np.float32, "confidence": np.float32, "class_id": np.int64, "track_id": np.int64}
 
 
@@ -94,12 +98,13 @@ class RawOutputs:
     lane: NDArray[np.uint8] | None
 
     def __post_init__(self) -> None:
-        if self.detection is not None and (self.detection.ndim != 3 or self.detection.shape[2] < 6):
-            raise ShapeError(f"detection must be (B, N, 5 + classes), got {self.detection.shape}")
+        rows = self.detection
+        if rows is not None and not (isinstance(rows, np.ndarray) and rows.ndim == 3 and rows.shape[2] > 5):
+            raise ShapeError(f"detection must be (B, N, 5 + classes), got {_told(rows)}")
         for name in ("drivable", "lane"):
             mask = getattr(self, name)
-            if mask is not None and (mask.ndim != 3 or mask.dtype != np.uint8):
-                raise ShapeError(f"{name} must be (B, H, W) uint8, got {mask.shape} {mask.dtype}")
+            if mask is not None and not (isinstance(mask, np.ndarray) and mask.ndim == 3 and mask.dtype == np.uint8):
+                raise ShapeError(f"{name} must be (B, H, W) uint8, got {_told(mask)}")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -131,12 +136,17 @@ class Perception:
     def __post_init__(self) -> None:
         for name in ("drivable", "lane"):
             mask = getattr(self, name)
-            if mask is not None and (mask.shape != self.size or mask.dtype != np.bool_):
-                raise ShapeError(f"{name} must be {self.size} bool, got {mask.shape} {mask.dtype}")
-        if self.image is not None and self.image.shape != (*self.size, 3):
-            raise ShapeError(f"image must be {(*self.size, 3)}, got {self.image.shape}")
-        if self.boxes is not None and len(self.boxes):
-            for class_id in (int(self.boxes.class_id.min()), int(self.boxes.class_id.max())):
+            if mask is not None and not (
+                isinstance(mask, np.ndarray) and mask.shape == tuple(self.size) and mask.dtype == np.bool_
+            ):
+                raise ShapeError(f"{name} must be {self.size} bool, got {_told(mask)}")
+        image, boxes = self.image, self.boxes
+        if image is not None and not (isinstance(image, np.ndarray) and image.shape == (*self.size, 3)):
+            raise ShapeError(f"image must be {(*self.size, 3)}, got {_told(image)}")
+        if boxes is not None and not isinstance(boxes, Boxes):
+            raise ShapeError(f"boxes must be Boxes, got a {type(boxes).__name__}")
+        if boxes is not None and len(boxes):
+            for class_id in (int(boxes.class_id.min()), int(boxes.class_id.max())):
                 if not 0 <= class_id < len(self.class_names):
                     raise ShapeError(f"class id {class_id} has no name among {self.class_names}")
 
