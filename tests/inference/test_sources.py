@@ -575,6 +575,16 @@ def test_a_picture_by_two_ways_is_one_and_a_link_of_another_name_is_its_own(tmp_
     assert [path.name for source in found if isinstance(source, Stills) for path in source.paths] == ["a.png", "b.png"]
 
 
+def test_a_link_to_a_folder_above_gives_each_file_once_by_its_shortest_way(tmp_path: Path) -> None:
+    (tmp_path / "car").mkdir()
+    for name in ("a.png", "z.png"):
+        Image.fromarray(shade(0)).save(tmp_path / "car" / name)
+    (tmp_path / "car" / "link.png").symlink_to("z.png")
+    (tmp_path / "car" / "m").symlink_to("..")
+    pictures = tuple(tmp_path / "car" / name for name in ("a.png", "link.png", "z.png"))
+    assert find_sources([tmp_path / "**" / "*"]) == ([Stills(pictures)], [])
+
+
 @pytest.mark.parametrize("wrong", [{"every": 0}, {"max_frames": 0}, {"start": -1}, {"start": 3, "end": 2}])
 def test_impossible_clips_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigError):

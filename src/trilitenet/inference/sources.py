@@ -497,7 +497,7 @@ def find_sources(
                 if (shown := _printable(str(path))) != str(path):
                     failures.append(Failure(shown, f"{shown}: its name is not UTF-8; rename it"))
                     continue
-                place = path.parent.resolve() / path.name  # a link of another name gives a result of its own
+                place = _place(path)
                 if place in taken:
                     continue
                 taken.add(place)
@@ -557,13 +557,21 @@ def _expand(name: str) -> list[Path]:
     elif path.exists():
         return [path]
     elif glob.has_magic(name):
-        matches = glob.glob(name, recursive=True)  # noqa: PTH207 - a pattern, not a folder
-        files = [Path(match) for match in matches if _is_file(Path(match))]
+        places: dict[Path, Path] = {}
+        # The shortest way to each: a link to a folder above it leads to all in that again and again.
+        for match in sorted(map(Path, glob.glob(name, recursive=True)), key=lambda path: len(path.parts)):  # noqa: PTH207
+            places.setdefault(_place(match), match)
+        files = [match for match in places.values() if _is_file(match)]
         if not files:
             raise InputError(f"{name}: no file matches")
     else:
         raise InputError(f"{name}: no such file or folder")
     return sorted(files, key=lambda file: [int(t) if t.isdecimal() else t for t in re.split(r"(\d+)", str(file))])
+
+
+def _place(path: Path) -> Path:
+    """Return where a path is, by whatever ways; a link of another name is a place, and gives a result, of its own."""
+    return path.parent.resolve() / path.name
 
 
 def _is_file(path: Path) -> bool:
