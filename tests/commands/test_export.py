@@ -118,11 +118,14 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Predictor:
     return trilitenet.load(made.path)
 
 
-def test_a_program_goes_to_other_processes(program: Predictor) -> None:
+def test_a_program_goes_to_other_processes_and_can_be_closed(program: Predictor) -> None:
     assert program.backend.name == "torch program cpu"
     copy = pickle.loads(pickle.dumps(program))  # noqa: S301 - its own
     image = np.full((64, 96, 3), 90, np.uint8)
     np.testing.assert_array_equal(copy(image).lane, program(image).lane)
+    copy.close()
+    with pytest.raises(BackendError, match=r"a\.pt2: the model was closed"):
+        copy(image)
 
 
 def test_a_dynamic_program_says_how_small_a_side_may_be(program: Predictor) -> None:

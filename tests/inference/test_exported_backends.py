@@ -238,10 +238,11 @@ def test_an_interruption_leaves_every_request_idle(artefacts: Artefacts) -> None
     assert len(lane) == len(images)
 
 
-def test_a_closed_model_says_so(artefacts: Artefacts) -> None:
-    backend = OpenVINOBackend(artefacts.folder / "model.xml")
+@pytest.mark.parametrize("kind", [OnnxBackend, OpenVINOBackend])
+def test_a_closed_model_says_so(artefacts: Artefacts, kind: Any) -> None:
+    backend = kind(artefacts.folder / "model.onnx")
     backend.close()
-    with pytest.raises(BackendError, match="closed"):
+    with pytest.raises(BackendError, match=r"model\.onnx: the model was closed; load it again"):
         backend.run(artefacts.images)
 
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -58,7 +59,16 @@ def test_name_and_canvas(backend: TorchBackend) -> None:
     assert backend.name == "torch cpu"
     assert backend.canvas is None
     assert backend.card.variant == "tiny"
+
+
+def test_a_closed_model_says_so_and_is_free(backend: TorchBackend) -> None:
+    network = weakref.ref(backend.network)
     backend.close()
+    backend.close()
+    assert network() is None
+    assert (backend.name, backend.card.variant) == ("torch cpu", "tiny")
+    with pytest.raises(BackendError, match=r"tiny: the model was closed; load it again"):
+        backend.run(np.zeros((1, 64, 64, 3), np.uint8))
 
 
 def test_sizes_that_are_no_multiple_of_32_are_refused(backend: TorchBackend) -> None:

@@ -6,7 +6,7 @@ import contextlib
 import os
 import threading
 from collections.abc import Callable, Iterator
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,9 @@ from trilitenet.errors import BackendError, ShapeError
 from trilitenet.processing.cores import usable_cores
 from trilitenet.structures import RawOutputs
 
-__all__ = ["MOST_PARALLEL", "Backend", "ParallelSessions", "check_batch", "check_process", "replaced"]
+__all__ = ["MOST_PARALLEL", "Backend", "ParallelSessions", "check_batch", "check_process", "held", "replaced"]
+
+T = TypeVar("T")
 
 MOST_PARALLEL: Final = 4
 """At most so many images are computed at once where a backend trades latency for images a second."""
@@ -53,6 +55,21 @@ def check_process(opened_in: int) -> None:
             "the model was opened before this process was forked; load it in this process, or start processes with "
             "multiprocessing.get_context('spawn')"
         )
+
+
+def held(what: T | None, model: object) -> T:
+    """Return what a backend computes with, which `Backend.close` lets go.
+
+    Args:
+        what: What it holds; None after that.
+        model: What was loaded, for the message.
+
+    Raises:
+        BackendError: If it was closed.
+    """
+    if what is None:
+        raise BackendError(f"{model}: the model was closed; load it again")
+    return what
 
 
 _REPLACING: Final = threading.Lock()
@@ -134,7 +151,7 @@ class Backend(Protocol):
 
         Raises:
             ShapeError: If the runtime cannot take that size.
-            BackendError: If the runtime fails.
+            BackendError: If the runtime fails, or the backend was closed.
         """
         ...
 

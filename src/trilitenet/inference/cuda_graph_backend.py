@@ -14,7 +14,7 @@ from torch import Tensor
 
 from trilitenet.config import MAX_STRIDE, TASKS, ModelCard
 from trilitenet.errors import BackendError
-from trilitenet.inference.backend import check_batch
+from trilitenet.inference.backend import check_batch, held
 from trilitenet.inference.torch_backend import pick_device
 from trilitenet.structures import RawOutputs
 
@@ -60,7 +60,9 @@ class CudaGraphBackend:
         self.device = pick_device(device)
         if self.device.type != "cuda":
             raise BackendError(f"CUDA graphs need a CUDA device, not {self.device}; use backend 'torch'")
-        self._graph = graph.to(self.device).eval() if isinstance(graph, torch.nn.Module) else graph
+        self._graph: Callable[[Tensor], Sequence[Tensor | None]] | None = (
+            graph.to(self.device).eval() if isinstance(graph, torch.nn.Module) else graph
+        )
         self._card = card
         self._shapes = shapes
         self._captured: collections.OrderedDict[tuple[int, ...], _Captured] = collections.OrderedDict()
@@ -106,12 +108,14 @@ class CudaGraphBackend:
         return RawOutputs(**found)
 
     def close(self) -> None:
-        """Free the captured graphs and their memory."""
+        """Free the network, the captured graphs and their memory."""
         with self._lock:
+            self._graph = None
             self._captured.clear()
 
     def _get(self, shape: tuple[int, ...]) -> _Captured:
         """Return the captured graph of a batch shape, made now if it is not there."""
+        network = held(self._graph, self._card.variant)
         if shape in self._captured:
             self._captured.move_to_end(shape)
             return self._captured[shape]
@@ -123,11 +127,11 @@ class CudaGraphBackend:
         side.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(side):
             for _ in range(_WARM_UP):
-                self._graph(pixels)
+                network(pixels)
         torch.cuda.current_stream().wait_stream(side)
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph):
-            outputs = tuple(self._graph(pixels))
+            outputs = tuple(network(pixels))
         results = tuple(
             None if output is None else torch.empty(output.shape, dtype=output.dtype, pin_memory=True)
             for output in outputs

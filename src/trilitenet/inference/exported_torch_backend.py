@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY
 from trilitenet.errors import ShapeError, WeightsError
+from trilitenet.inference.backend import held
 from trilitenet.inference.exported import ArtefactBackend, prepare_input, read_metadata
 from trilitenet.inference.torch_backend import check_threads, pick_device
 
@@ -53,7 +54,7 @@ class ExportedTorchBackend(ArtefactBackend):
         self._card, self.info = read_metadata(found, str(path))
         self.device = pick_device("cpu" if device == "auto" else device)
         self._path = path
-        self._module = program.module().to(self.device)
+        self._module: torch.nn.Module | None = program.module().to(self.device)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle it as what opens it again: its file, which must be there, and its device."""
@@ -65,6 +66,7 @@ class ExportedTorchBackend(ArtefactBackend):
         return f"torch program {self.device}"
 
     def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
+        module = held(self._module, self._path)
         check_threads()
         height, width = batch.shape[1:3]
         if self.info.size is None and min(height, width) < 64:
@@ -78,7 +80,7 @@ class ExportedTorchBackend(ArtefactBackend):
                     name: value.cpu().numpy()
                     for name, value in zip(
                         self._card.tasks,
-                        self._module(torch.from_numpy(prepare_input(image, self.info)).to(self.device)),
+                        module(torch.from_numpy(prepare_input(image, self.info)).to(self.device)),
                         strict=True,
                     )
                 }
@@ -86,4 +88,5 @@ class ExportedTorchBackend(ArtefactBackend):
             ]
 
     def close(self) -> None:
-        """Nothing to free."""
+        """Free the program."""
+        self._module = None

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import GRAPH_HASH_KEY, WEIGHTS_HASH_KEY, ArtefactInfo, ModelCard, parse_json
 from trilitenet.errors import BackendError, ConfigError, WeightsError, import_extra
-from trilitenet.inference.backend import ParallelSessions, check_process
+from trilitenet.inference.backend import ParallelSessions, check_process, held
 from trilitenet.inference.exported import ArtefactBackend, prepare_input, read_metadata
 
 __all__ = ["NcnnBackend"]
@@ -89,9 +89,7 @@ class NcnnBackend(ParallelSessions, ArtefactBackend):
         return f"ncnn cpu {self.precision}"
 
     def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
-        net = self._session
-        if net is None:
-            raise BackendError(f"{self._path}: the model was closed")
+        net = held(self._session, self._path)
         check_process(self._process)
         return [self._run(net, image) for image in batch]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.errors import BackendError, WeightsError, import_extra
-from trilitenet.inference.backend import ParallelSessions
+from trilitenet.inference.backend import ParallelSessions, held
 from trilitenet.inference.exported import ArtefactBackend, check_graph, prepare_input, read_metadata
 
 __all__ = ["OnnxBackend"]
@@ -78,8 +78,10 @@ class OnnxBackend(ParallelSessions, ArtefactBackend):
         return f"onnxruntime {self._device} {self.info.precision}"
 
     def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
-        runs = (self._session.run(None, {self._input: prepare_input(image, self.info)}) for image in batch)
+        session = held(self._session, self._path)
+        runs = (session.run(None, {self._input: prepare_input(image, self.info)}) for image in batch)
         return [dict(zip(self._outputs, values, strict=True)) for values in runs]
 
     def close(self) -> None:
-        """Nothing to free before the object goes."""
+        """Free the session."""
+        self._session = None

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY
 from trilitenet.errors import BackendError, ConfigError, WeightsError, import_extra
-from trilitenet.inference.backend import MOST_PARALLEL, check_process, replaced
+from trilitenet.inference.backend import MOST_PARALLEL, check_process, held, replaced
 from trilitenet.inference.exported import ArtefactBackend, check_graph, prepare_input, read_metadata
 from trilitenet.processing.cores import usable_cores
 
@@ -143,9 +143,7 @@ class OpenVINOBackend(ArtefactBackend):
 
     def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
         """Compute the images of a batch at once, as far as there are streams."""
-        idle = self._idle
-        if idle is None:
-            raise BackendError(f"{self._path}: the model was closed")
+        idle = held(self._idle, self._path)
         check_process(self._process)
         results: list[Mapping[str, NDArray[Any]]] = []
         inputs = collections.deque(prepare_input(image, self.info) for image in batch)

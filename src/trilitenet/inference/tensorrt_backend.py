@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard, parse_json
 from trilitenet.errors import BackendError, WeightsError, import_extra
+from trilitenet.inference.backend import held
 from trilitenet.inference.exported import ArtefactBackend, prepare_input, read_metadata
 
 __all__ = ["MAGIC", "TensorRTBackend", "pack_engine", "unpack_engine"]
@@ -65,14 +66,15 @@ class TensorRTBackend(ArtefactBackend):  # pragma: no cover - needs a GPU and Te
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self._card, self.info, engine = unpack_engine(Path(path))
+        self._path = Path(path)
+        self._card, self.info, engine = unpack_engine(self._path)
         tensorrt = import_extra("tensorrt", "tensorrt")
         self._cuda = import_extra("cuda.bindings.runtime", "tensorrt")
         runtime = tensorrt.Runtime(tensorrt.Logger(tensorrt.Logger.ERROR))
         self._engine = runtime.deserialize_cuda_engine(engine)
         if self._engine is None:
             raise BackendError(f"{path}: TensorRT refuses this engine; build it on the GPU that runs it")
-        self._context = self._engine.create_execution_context()
+        self._context: Any = self._engine.create_execution_context()
         self._stream = self._call(self._cuda.cudaStreamCreate())
         self._names = [self._engine.get_tensor_name(i) for i in range(self._engine.num_io_tensors)]
         self._memory: dict[str, int] = {}
@@ -89,7 +91,7 @@ class TensorRTBackend(ArtefactBackend):  # pragma: no cover - needs a GPU and Te
         return f"tensorrt cuda {self.info.precision}"
 
     def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
-        kinds = self._cuda.cudaMemcpyKind
+        context, kinds = held(self._context, self._path), self._cuda.cudaMemcpyKind
         results: list[Mapping[str, NDArray[Any]]] = []
         for image in batch:
             value = prepare_input(image, self.info)
@@ -102,7 +104,7 @@ class TensorRTBackend(ArtefactBackend):  # pragma: no cover - needs a GPU and Te
                     self._stream,
                 )
             )
-            self._context.execute_async_v3(self._stream)
+            context.execute_async_v3(self._stream)
             result = {}
             for name in self._names:
                 if name != "image":
@@ -125,6 +127,7 @@ class TensorRTBackend(ArtefactBackend):  # pragma: no cover - needs a GPU and Te
         for address in self._memory.values():
             self._cuda.cudaFree(address)
         self._memory = {}
+        self._context = None
 
     def _call(self, answer: Any) -> Any:
         """Return the result of a CUDA call.

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from trilitenet.config import ModelCard
 from trilitenet.errors import BackendError
-from trilitenet.inference.backend import MOST_PARALLEL, check_batch
+from trilitenet.inference.backend import MOST_PARALLEL, check_batch, held
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
 from trilitenet.structures import RawOutputs
 
@@ -76,12 +76,18 @@ class TorchBackend:
         check_threads()
         self._canvas = canvas
         self.device = pick_device(device)
-        self.network: TriLiteNet = network.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+        self._card = network.card
+        self._network: TriLiteNet | None = network.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+
+    @property
+    def network(self) -> TriLiteNet:
+        """The network on its device; a `BackendError` once the backend was closed."""
+        return held(self._network, self._card.variant)
 
     @property
     def card(self) -> ModelCard:
         """What the network is."""
-        return self.network.card
+        return self._card
 
     @property
     def name(self) -> str:
@@ -131,7 +137,8 @@ class TorchBackend:
             torch.set_num_threads(cores)
 
     def close(self) -> None:
-        """Nothing to free."""
+        """Let the network go."""
+        self._network = None
 
 
 def _foreground(logits: Tensor) -> NDArray[np.uint8]:
