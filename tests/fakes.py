@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import ModelCard
-from trilitenet.errors import BackendError
+from trilitenet.errors import BackendError, part_of
 from trilitenet.structures import RawOutputs
 
 
@@ -61,3 +67,20 @@ def coloured_scene(height: int = 360, width: int = 640) -> NDArray[np.uint8]:
     image[height // 2 :, width // 2 : width // 2 + max(4, width // 80)] = (20, 20, 220)
     image[height // 4 : height // 2, width // 4 : width // 2] = (220, 20, 20)
     return image
+
+
+@contextlib.contextmanager
+def written_by_another_process(path: Path) -> Iterator[None]:
+    """Inside, another process has claimed a file and begun to write it; then it is killed."""
+    program = (
+        "import fcntl, sys; file = open(sys.argv[1], 'w'); fcntl.lockf(file, fcntl.LOCK_EX); "
+        "print('half', file=file, flush=True); print('claimed', flush=True); sys.stdin.read()"
+    )
+    command = [sys.executable, "-c", program, str(part_of(path))]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "claimed\n"
+        try:
+            yield
+        finally:
+            process.kill()

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from trilitenet.errors import (
+    Claim,
     FreeNames,
     MissingExtraError,
     OutputError,
@@ -75,6 +76,21 @@ def test_a_temporary_name_is_no_longer_than_the_system_takes(tmp_path: Path, nam
     part_of(path).replace(path)
     assert path.read_text() == "newer"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="files are not locked there")
+def test_a_claim_goes_with_what_has_no_name_yet(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    claim = Claim(path)
+    assert part_of(path).exists()
+    claim.close()
+    assert not list(tmp_path.iterdir())
+    claim = Claim(path)
+    part_of(path).replace(path)
+    part_of(path).write_text("of another process by now")
+    claim.close()
+    assert part_of(path).exists()
+    Claim(tmp_path / "nowhere" / "a.txt").close()
 
 
 def test_who_may_read_a_file_is_as_before_and_as_the_process_makes_files(tmp_path: Path) -> None:

@@ -25,15 +25,22 @@ import secrets
 import stat
 import sys
 import tempfile
+import weakref
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Final
 
+try:
+    import fcntl
+except ModuleNotFoundError:  # on Windows
+    fcntl = None  # type: ignore[assignment]
+
 __all__ = [
     "LONGEST_NAME",
     "BackendError",
+    "Claim",
     "ConfigError",
     "DataError",
     "FreeNames",
@@ -224,6 +231,58 @@ def part_of(path: Path) -> Path:
     if len(os.fsencode(name)) > LONGEST_NAME:
         name = f"{path.name[:_BEGINNING]}.{zlib.crc32(os.fsencode(path.name)):08x}.part"
     return path.with_name(name)
+
+
+class Claim:
+    """Keeps other processes from writing a file, while it is written as `part_of` names it.
+
+    Where the system or the file system knows no locks, it keeps off nobody.
+
+    Args:
+        path: The file; its folder exists.
+
+    Raises:
+        OutputError: If another process writes it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        part, number = part_of(path), None
+        while fcntl is not None and number is None:
+            try:
+                number = os.open(part, os.O_RDWR | os.O_CREAT, 0o666)
+                fcntl.lockf(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                if number is not None:
+                    os.close(number)
+                    number = None
+                    if isinstance(error, (BlockingIOError, PermissionError)):
+                        reason = "another process is writing it; wait for its end, or choose another --output"
+                        raise OutputError(f"{path}: {reason}") from None
+                break  # what is wrong with its place is told by whoever writes it
+            if not _is_named(number, part):  # the other process has just given it its name
+                os.close(number)
+                number = None
+        self._let_go = weakref.finalize(self, _let_go, number, part)
+        self._let_go.atexit = False
+
+    def close(self) -> None:
+        """Let the file go; what has not got its name by then is removed."""
+        self._let_go()
+
+
+def _let_go(number: int | None, part: Path) -> None:
+    if number is None or _is_named(number, part):
+        with contextlib.suppress(OSError):
+            part.unlink()
+    if number is not None:
+        os.close(number)
+
+
+def _is_named(number: int, path: Path) -> bool:
+    """Return whether a path is the open file of this number."""
+    with contextlib.suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(number), path.stat())
+    return False
 
 
 class FreeNames:

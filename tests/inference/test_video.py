@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.fakes import ColourBackend, coloured_scene
+from tests.fakes import ColourBackend, coloured_scene, written_by_another_process
 from trilitenet.errors import BackendError, ConfigError, InputError, OutputError, ShapeError
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Failure, Frame, FrameReader, Stills, VideoReader
@@ -319,6 +319,19 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
             break
     with pytest.raises(OutputError, match=r"a\.mp4: the video cannot be written"):
         writer.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="files are not locked there")
+def test_a_video_that_another_process_writes_is_left_to_it(tmp_path: Path) -> None:
+    with written_by_another_process(tmp_path / "a.mp4"):
+        writer = VideoWriter(tmp_path / "a.mp4")
+        writer.write(coloured_scene(32, 32))
+        with pytest.raises(OutputError, match=r"a\.mp4: another process is writing it; wait for its end"):
+            writer.close()
+        assert (tmp_path / "a.mp4.part").read_text() == "half\n"
+    with VideoWriter(tmp_path / "a.mp4") as writer:
+        writer.write(coloured_scene(32, 32))
+    assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
 
 
 def resident() -> float:

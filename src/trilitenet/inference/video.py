@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.errors import ConfigError, InputError, OutputError, ShapeError, import_extra, part_of
+from trilitenet.errors import Claim, ConfigError, InputError, OutputError, ShapeError, import_extra, part_of
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Failure, Frame, FrameReader, Stills
 from trilitenet.processing.images import to_rgb
@@ -261,7 +261,7 @@ class VideoWriter:
             raise ConfigError(f"{path}: frames a second must be above 0, got {rate:g}")
         self.frames = 0
         self.pixel_aspect: Fraction | None = None
-        self._partial = part_of(path)
+        self._claimed = contextlib.ExitStack()
         self._rate = rate or 30.0
         self._options = {"crf": str(quality), "preset": preset}
         self._size: tuple[int, int] | None = None
@@ -323,15 +323,16 @@ class VideoWriter:
             if self._container is not None:
                 self._mux(None)
                 self._container.close()
-                self._partial.replace(self.path)
+                part_of(self.path).replace(self.path)
+                self._claimed.close()
         except Exception as error:  # whatever it is, the caller must hear of it and not wait
             reason = getattr(error, "strerror", None) or str(error)
-            self._error = OutputError(f"{self.path}: the video cannot be written ({reason})")
+            cannot = OutputError(f"{self.path}: the video cannot be written ({reason})")
+            self._error = error if isinstance(error, OutputError) else cannot
             if self._container is not None:
                 with contextlib.suppress(Exception):
                     self._container.close()
-            with contextlib.suppress(OSError):
-                self._partial.unlink(missing_ok=True)
+            self._claimed.close()
             while item is not None:  # so that nobody waits for a place in the queue for ever
                 item = self._waiting.get()
 
@@ -354,7 +355,8 @@ class VideoWriter:
     def _open(self, height: int, width: int) -> None:
         self._size = (height, width)
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._container = self._av.open(str(self._partial), "w", format="mp4", options={"movflags": "+faststart"})
+        self._claimed.callback(Claim(self.path).close)
+        self._container = self._av.open(str(part_of(self.path)), "w", format="mp4", options={"movflags": "+faststart"})
         rate = Fraction(self._rate).limit_denominator(1001)
         self._stream = self._container.add_stream("libx264", rate=rate, options=self._options)
         self._stream.width, self._stream.height = width + width % 2, height + height % 2

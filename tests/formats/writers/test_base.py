@@ -3,6 +3,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
+import gc
 import importlib
 import io
 import json
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.fakes import written_by_another_process
 from trilitenet.errors import ConfigError, OutputError, part_of
 from trilitenet.formats.writers.base import WRITERS, JsonStream, open_writer, uninterrupted
 from trilitenet.structures import Boxes, Perception
@@ -53,6 +55,30 @@ def test_no_writer_replaces_a_file_unasked(format_name: str, tmp_path: Path, pic
     with pytest.raises(OutputError, match="--overwrite"):
         write(overwrite=False)
     write(overwrite=True)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="files are not locked there")
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [("coco", "coco.json"), ("json", "a.json"), ("jsonl", "perceptions.jsonl"), ("csv", "boxes.csv")],
+)
+def test_a_file_that_another_process_writes_is_left_to_it(
+    name: str, file: str, tmp_path: Path, video: list[Perception]
+) -> None:
+    def write() -> None:
+        with open_writer(name, tmp_path, overwrite=True) as writer:
+            for perception in video:
+                writer.write(dataclasses.replace(perception, source="a.mp4"))
+
+    with written_by_another_process(tmp_path / file):
+        with pytest.raises(OutputError, match=rf"{file}: another process is writing it; wait for its end"):
+            write()
+        assert part_of(tmp_path / file).read_text() == "half\n"
+        gc.collect()
+        assert list(tmp_path.iterdir()) == [part_of(tmp_path / file)]
+    write()
+    assert (tmp_path / file).exists()
+    assert not list(tmp_path.glob("*.part"))
 
 
 def test_a_writer_that_is_given_nothing_replaces_nothing(

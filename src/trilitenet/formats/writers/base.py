@@ -28,7 +28,7 @@ from typing import IO, TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.errors import ConfigError, FreeNames, OutputError, did_you_mean, part_of, writing
+from trilitenet.errors import Claim, ConfigError, FreeNames, OutputError, did_you_mean, part_of, writing
 from trilitenet.structures import Perception
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class Writer(abc.ABC):
         self.output = output
         self.overwrite = overwrite
         self.files: list[Path] = []
-        self._begun: list[Path] = []
+        self._begun: dict[Path, Claim] = {}
         self._stems: dict[str, str] = {}
         self._free = FreeNames(files=True)
         self._names: Counter[str] = Counter()
@@ -114,7 +114,11 @@ class Writer(abc.ABC):
         """
         self._closed = True
         with uninterrupted():
-            self._close()
+            try:
+                self._close()
+            finally:
+                while self._begun:
+                    self._begun.popitem()[1].close()
 
     @abc.abstractmethod
     def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
@@ -134,8 +138,6 @@ class Writer(abc.ABC):
         try:
             self.close()
         except (OSError, ValueError):  # the latter from a file that an earlier failure has closed
-            for path in set(self._begun) - set(self.files):
-                part_of(path).unlink(missing_ok=True)
             if not self._broken:  # told already
                 raise
 
@@ -143,14 +145,15 @@ class Writer(abc.ABC):
         """Return the path of a file to write, in a folder that exists.
 
         Raises:
-            OutputError: If it exists and ``overwrite`` was not asked for, or the folder cannot be made.
+            OutputError: If it exists and ``overwrite`` was not asked for, or another process is writing it, or the
+                folder cannot be made.
         """
         path = self.output / name
         if path.exists() and not self.overwrite:
             raise OutputError(f"{path} exists; choose another --output or add --overwrite")
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-        self._begun.append(path)
+        self._begun[path] = Claim(path)
         return path
 
     def finish(self, path: Path) -> None:
@@ -158,21 +161,18 @@ class Writer(abc.ABC):
 
         One without any result goes too where it would replace another.
         """
-        if self._broken or (self._empty and path.exists()):
-            part_of(path).unlink(missing_ok=True)
-        else:
+        if not (self._broken or (self._empty and path.exists())):
             part_of(path).replace(path)
             self.files.append(path)
-        self._begun.remove(path)
+        self._begun.pop(path).close()
 
     def write_whole(self, path: Path, text: str) -> None:
         """Write a small file at once, so that it is whole or not there."""
-        partial = part_of(path)
         try:
-            partial.write_text(text, encoding="utf-8")
+            part_of(path).write_text(text, encoding="utf-8")
             self.finish(path)
         except BaseException:
-            partial.unlink(missing_ok=True)
+            self._begun.pop(path).close()
             raise
 
     def stem(self, source: str | None) -> str:
