@@ -342,6 +342,22 @@ def test_openvino_without_its_weights_file(artefacts: Artefacts, tmp_path: Path)
         OpenVINOBackend(tmp_path / "model.xml")
 
 
+@pytest.mark.parametrize("kind", [OnnxBackend, OpenVINOBackend])
+def test_a_graph_that_was_cut_off_is_told_in_our_words(
+    artefacts: Artefacts, tmp_path: Path, capfd: pytest.CaptureFixture[str], kind: Any
+) -> None:
+    whole = (artefacts.folder / "model.onnx").read_bytes()
+    path = tmp_path / "model.onnx"
+    for length in (len(whole) - 1, len(whole) // 2, 100):
+        path.write_bytes(whole[:length])
+        with pytest.raises(WeightsError, match=r"ONNX model \(cut off or damaged; export it again\)$"):
+            kind(path)
+    path.write_bytes(whole[:8])
+    with pytest.raises(WeightsError, match="ONNX model"):
+        kind(path)
+    assert capfd.readouterr() == ("", "")
+
+
 def test_broken_programs_print_nothing_of_their_own(tmp_path: Path) -> None:
     contents = {"empty.pt2": b"", "text.pt2": b"not a program\n" * 20, "zip.pt2": b"PK\5\6" + bytes(18)}
     for name, content in contents.items():

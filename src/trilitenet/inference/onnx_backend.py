@@ -66,6 +66,8 @@ class OnnxBackend(ParallelSessions, ArtefactBackend):
             return self._runtime.InferenceSession(str(self._path), options, providers=self._providers)
         except Exception as error:  # its exceptions share no base class of their own
             reason = " ".join(str(error).split())[:160]
+            if "INVALID_PROTOBUF" in reason:
+                reason = "cut off or damaged; export it again"
             raise WeightsError(f"{self._path}: not a usable ONNX model ({reason})") from error
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -63,9 +63,10 @@ class OpenVINOBackend(ArtefactBackend):
         if streams < 1:
             raise ConfigError(f"streams must be at least 1, got {streams}")
         with path.open("rb") as file:
-            start = file.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
+            start = file.read(64)
         # Checked here because OpenVINO tries every reader it has on a foreign file, and some of them talk.
-        if not start.startswith(b"\x08" if path.suffix.lower() == ".onnx" else (b"<?xml", b"<net")):
+        begins = (b"\x08",) if path.suffix.lower() == ".onnx" else (b"<?xml", b"<net")
+        if len(start) < 64 or not start.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(begins):
             raise WeightsError(f"{path}: not a usable OpenVINO or ONNX model (it does not begin as one)")
         weights = path.with_suffix(".bin")
         if path.suffix.lower() == ".xml" and not weights.is_file():
@@ -76,7 +77,9 @@ class OpenVINOBackend(ArtefactBackend):
             model = core.read_model(path)
         except RuntimeError as error:
             reason = " ".join(str(error).split())[:160]
-            if "is_valid_weights_range" in str(error):
+            if "ParseFromIstream" in str(error):
+                reason = "cut off or damaged; export it again"
+            elif "is_valid_weights_range" in str(error):
                 reason = f"{weights.name} is cut off, or of another file; export it again"
             raise WeightsError(f"{path}: not a usable OpenVINO or ONNX model ({reason})") from error
         self._card, self.info = read_metadata(_metadata(model), str(path))
