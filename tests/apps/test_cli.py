@@ -247,6 +247,25 @@ def test_help_loads_no_runtime(words: list[str]) -> None:
     subprocess.run([sys.executable, "-c", script, *words], check=True, timeout=60, capture_output=True)
 
 
+@pytest.mark.parametrize(
+    ("command", "given", "spins"),
+    [
+        ("predict", {}, "10000"),
+        ("predict", {"GOMP_SPINCOUNT": "7"}, "7"),
+        ("predict", {"OMP_WAIT_POLICY": "ACTIVE"}, None),
+        ("train", {}, None),
+    ],
+)
+def test_threads_wait_less_at_full_load_beside_the_stages_of_a_video(
+    command: str, given: dict[str, str], spins: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["trilitenet", command])
+    monkeypatch.setattr(os, "environ", dict(given))
+    monkeypatch.setattr(cli, "build_app", lambda words: lambda *_, **__: None)
+    assert cli.main() == 0
+    assert os.environ.get("GOMP_SPINCOUNT") == spins
+
+
 def test_python_m_is_the_command() -> None:
     done = subprocess.run([sys.executable, "-m", "trilitenet", "--version"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0
