@@ -138,3 +138,17 @@ def test_hooks_are_called() -> None:
     block.act.register_forward_hook(lambda *_: called.append("act alone"))
     block(torch.randn(2, 3, 8, 8).to(memory_format=torch.channels_last))
     assert called == ["act alone"]
+
+
+def test_transforms_of_functions_take_the_plain_way() -> None:
+    x, _ = case(6, torch.float64, torch.channels_last)
+    _, act = layers(6, torch.float64)
+
+    def loss(image: Tensor) -> Tensor:
+        total: Tensor = act(image).square().sum()
+        return total
+
+    images = x.detach()[:, None]
+    gradients = torch.func.vmap(torch.func.grad(loss))(images)
+    for image, gradient in zip(images, gradients, strict=True):
+        torch.testing.assert_close(gradient, torch.autograd.grad(loss(image.requires_grad_()), image)[0])

@@ -83,13 +83,14 @@ def _has_hooks(module: nn.Module) -> bool:
 
 
 def _by_rows(x: Tensor) -> bool:
-    """Return whether the row-wise way applies: training on a CPU, channels-last."""
+    """Return whether the row-wise way applies: training on a CPU, channels-last, under no transform of torch.func."""
     return (
         x.device.type == "cpu"
         and x.ndim == 4
         and torch.is_grad_enabled()
         and not _jit.is_tracing()
         and not torch.compiler.is_compiling()
+        and not torch._C._are_functorch_transforms_active()
         and x.is_contiguous(memory_format=torch.channels_last)
     )
 
