@@ -266,6 +266,13 @@ def test_threads_wait_less_at_full_load_beside_the_stages_of_a_video(
     assert os.environ.get("GOMP_SPINCOUNT") == spins
 
 
+def test_a_size_in_one_word_is_told_to_have_two(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["benchmark", "--size", "384x640"]) == 2
+    assert "--size requires 2 values, got 1 (see: trilitenet benchmark --help)" in capsys.readouterr().err.replace(
+        '"', ""
+    )
+
+
 def test_python_m_is_the_command() -> None:
     done = subprocess.run([sys.executable, "-m", "trilitenet", "--version"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0

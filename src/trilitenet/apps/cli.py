@@ -297,7 +297,7 @@ def _one_line(error: CycloptsError) -> str:
     elif isinstance(error, UnusedCliTokensError):
         text = f"unexpected {' '.join(error.unused_tokens or ())}"
     else:
-        text = " ".join(str(error).split())
+        text = " ".join(str(error).split()).replace("positional arguments. Only got", "values, got")
     chain = " ".join(["trilitenet", *(error.command_chain or ())])
     return f"{text.rstrip('.')} (see: {chain} --help)"
 
