@@ -294,6 +294,8 @@ def test_the_page_names_what_the_model_sees(
         assert browser["confidence"].is_displayed() == ("detection" in tasks)
         if tasks == TASKS:
             assert browser.see(photo).startswith("2 buses;")
+            browser.set_range("confidence", 0.95)
+            assert browser["summary"].text.startswith("no objects;")
     finally:
         assert running.stop()
 

@@ -59,7 +59,8 @@ function describe(boxes) {
     const counts = new Map();
     for (const box of boxes) counts.set(box.class_name, (counts.get(box.class_name) ?? 0) + 1);
     const names = [...counts].map(([name, count]) => `${count} ${count === 1 ? name : plural(name)}`);
-    parts.push(names.length ? names.join(", ") : `no ${current.perception.class_names.join(" or ")}`);
+    const { class_names: classes } = current.perception;
+    parts.push(names.join(", ") || `no ${classes.length === 1 ? classes[0] : "objects"}`);
   }
   const percent = (share) => `${(100 * share).toFixed(share < 0.1 ? 1 : 0)} %`;
   if (current.drivable) parts.push(`drivable area ${percent(current.drivable.share)} of the picture`);
