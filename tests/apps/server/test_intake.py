@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import asyncio
 import io
 import struct
 import zlib
+from collections.abc import AsyncIterator
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from trilitenet.apps.server.intake import (
     Reservation,
     check_header,
     decode,
+    read_body,
     read_header,
 )
 from trilitenet.apps.server.problems import BusyError, ProblemError
@@ -157,6 +160,52 @@ def test_every_scan_is_found(between: bytes) -> None:
     data = encode(picture(61, 47), "JPEG")
     scan = b"\xff\xda\x00\x08\x01\x01\x00\x00\x3f\x00" + between
     assert read_header(data[:-2] + 300 * scan + data[-2:]).scans == 301
+
+
+@pytest.mark.parametrize(
+    "segment",
+    [
+        b"\xff\xcc\x00\x04\x00\x10",  # conditions of arithmetic codes, whose marker is among those of frames
+        b"\xff\xd0\xff\xd7\xff\x01",  # markers without a length
+        b"\xff\xff\xff\xfe\x00\x02",  # fill bytes
+    ],
+)
+def test_segments_before_the_size_are_passed_over(segment: bytes) -> None:
+    data = encode(picture(61, 47), "JPEG")
+    assert read_header(data[:2] + segment + data[2:]) == Header("JPEG", 61, 47, 1)
+
+
+@pytest.mark.parametrize("length", [0, 1])
+def test_a_segment_is_no_shorter_than_its_length(length: int) -> None:
+    data = encode(picture(61, 47), "JPEG")
+    with pytest.raises(ProblemError, match="broken header"):
+        read_header(data[:2] + b"\xff\xfe\x00" + bytes([length]) + data[2:])
+
+
+def test_an_extended_webp_must_hold_its_size() -> None:
+    data = encode(picture(61, 47), "WEBP", icc_profile=b"x" * 200)
+    assert data[12:16] == b"VP8X"
+    with pytest.raises(ProblemError, match="inside its header"):
+        read_header(data[:29])
+
+
+async def _pieces(*pieces: bytes) -> AsyncIterator[bytes]:
+    for piece in pieces:
+        yield piece
+
+
+def test_a_body_is_paid_for_as_it_arrives() -> None:
+    settings = Settings(max_body=10)
+    reservation = Reservation(MemoryBudget(100))
+    assert asyncio.run(read_body(_pieces(b"12345", b"67890"), reservation, settings)) == b"1234567890"
+    assert reservation.held == 10
+    with pytest.raises(ProblemError, match="larger than 10 bytes") as caught:
+        asyncio.run(read_body(_pieces(b"12345", b"678901"), reservation, settings))
+    assert caught.value.status == 413
+    assert reservation.held == 15
+    reservation.budget.take(80)  # by others
+    with pytest.raises(BusyError):
+        asyncio.run(read_body(_pieces(b"12345", b"67890"), Reservation(reservation.budget), settings))
 
 
 def test_endless_segments_are_refused() -> None:

@@ -132,9 +132,7 @@ def _jpeg(data: bytes) -> Header:
         (length,) = struct.unpack_from(">H", data, position)
         if 0xC0 <= marker <= 0xCF and marker not in {0xC4, 0xC8, 0xCC}:
             height, width = struct.unpack_from(">HH", data, position + 3)
-            return Header("JPEG", width, height, max(1, _scans(data, position + length)))
-        if length < 2:
-            raise ProblemError(422, "broken_image", "the JPEG image has a broken header")
+            return Header("JPEG", width, height, _scans(data, position + length))
         position += length
     raise _too_many_segments()
 
