@@ -209,7 +209,7 @@ class Service:
         keep_image: bool,
     ) -> _T:
         loop = asyncio.get_running_loop()
-        pixels, canvas, letterbox, milliseconds = await self.in_pool(self._prepare, image, deadline, keep_image)
+        pixels, canvas, letterbox, milliseconds = await self.in_pool(self._prepare, image, keep_image)
         raw, waited, ran = await asyncio.wrap_future(self._batcher.submit(canvas, deadline))
         self._note(milliseconds, "queue", waited)
         self._note(milliseconds, "network", ran)
@@ -217,11 +217,9 @@ class Service:
         return await loop.run_in_executor(self._outcome, call)
 
     def _prepare(
-        self, image: Encoded | NDArray[np.uint8], deadline: float, keep_image: bool
+        self, image: Encoded | NDArray[np.uint8], keep_image: bool
     ) -> tuple[NDArray[np.uint8] | None, NDArray[np.uint8], Letterbox, dict[str, float]]:
         start = time.monotonic()
-        if start > deadline:
-            raise _too_late()
         milliseconds: dict[str, float] = {}
         if isinstance(image, Encoded):
             pixels = decode(image.data, image.header)
@@ -268,8 +266,4 @@ async def in_time(work: Awaitable[_T], deadline: float) -> _T:
     try:
         return await asyncio.wait_for(work, deadline - time.monotonic())
     except asyncio.TimeoutError:
-        raise _too_late() from None
-
-
-def _too_late() -> BusyError:
-    return BusyError("deadline", "the image waited too long; try again soon")
+        raise BusyError("deadline", "the image waited too long; try again soon") from None
