@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -70,6 +70,14 @@ def test_headers_that_trickle_are_cut_off(make_app: MakeApp, run_app: Run) -> No
         assert time.monotonic() - start < 2
 
 
+def test_late_headers_of_a_second_request_are_told(make_app: MakeApp, run_app: Run) -> None:
+    with _connect(run_app(make_app(header_timeout=0.2))) as connection:
+        connection.sendall(b"GET /healthz HTTP/1.1\r\nhost: x\r\n\r\n")
+        assert connection.recv(10000).startswith(b"HTTP/1.1 200")
+        connection.sendall(b"GET /heal")
+        assert _read_all(connection).startswith(b"HTTP/1.1 408")
+
+
 def test_line_breaks_do_not_keep_a_connection_open(make_app: MakeApp, run_app: Run) -> None:
     running = run_app(make_app(header_timeout=0.3, keep_alive=0.3))
     with _connect(running) as connection:
@@ -102,6 +110,16 @@ def test_long_headers_are_refused_also_when_they_are_there_at_once(app: Applicat
     with _connect(running) as connection:
         connection.sendall(b"GET /healthz HTTP/1.1\r\nhost: x\r\nx: " + b"y" * 32_000 + b"\r\n\r\n")
         assert connection.recv(1000).startswith(b"HTTP/1.1 200")
+
+
+def test_the_headers_of_each_request_count_alone(app: Application, run_app: Run) -> None:
+    client = http.client.HTTPConnection("127.0.0.1", run_app(app).port, timeout=10)
+    for _ in range(3):
+        client.request("GET", "/healthz", headers={"x": "y" * 20_000})
+        answer = client.getresponse()
+        answer.read()
+        assert (answer.status, answer.will_close) == (200, False)
+    client.close()
 
 
 @pytest.mark.parametrize(
@@ -145,12 +163,43 @@ def test_what_is_no_http_is_refused_in_the_form_of_every_refusal(
     assert json.loads(answer.split(b"\r\n\r\n")[1])["error"]["code"] == "bad_request"
 
 
+_BROKEN = b"POST /v1/predict HTTP/1.1\r\nhost: x\r\ntransfer-encoding: chunked\r\n\r\n1\r\nx\r\nno number\r\n"
+
+
+def test_a_request_whose_body_is_broken_is_not_waited_for(
+    make_app: MakeApp, run_app: Run, caplog: pytest.LogCaptureFixture
+) -> None:
+    running = run_app(make_app(upload_timeout=0.3))
+    with _connect(running) as connection:
+        connection.sendall(_BROKEN)
+        assert _read_all(connection).startswith(b"HTTP/1.1 400")
+        _wait(lambda: not running.server.server_state.tasks)
+        time.sleep(0.5)  # its time for the body passes
+    assert [record for record in caplog.records if record.levelno >= logging.ERROR] == []
+    assert running.app.service.memory.used == 0
+
+
+def test_a_refusal_is_not_taken_for_the_answer_to_an_earlier_request(
+    app: Application, run_app: Run, backend: FakeBackend, jpeg: bytes
+) -> None:
+    running = run_app(app)
+    backend.gate.clear()
+    with _connect(running) as connection:
+        connection.sendall(b"POST /v1/predict HTTP/1.1\r\nhost: x\r\ncontent-length: %d\r\n\r\n" % len(jpeg) + jpeg)
+        _wait(lambda: app.service.admission.taken)
+        connection.sendall(_BROKEN)
+        assert b"HTTP/1.1 400" not in _read_all(connection)
+    backend.gate.set()
+
+
 def test_a_request_needs_a_host(app: Application, run_app: Run) -> None:
     running = run_app(app)
     for version, status in ((b"1.1", b"400"), (b"1.0", b"200")):
         with _connect(running) as connection:
             connection.sendall(b"GET /healthz HTTP/" + version + b"\r\nconnection: close\r\n\r\n")
-            assert _read_all(connection).split()[1] == status
+            answer = _read_all(connection)
+            assert answer.split()[1] == status
+            assert b"\r\nserver:" not in answer.lower()
 
 
 @pytest.mark.parametrize("rest", [b"", b"x" * 70_000])
@@ -253,6 +302,23 @@ def test_too_many_connections_are_refused_and_the_rest_served(make_app: MakeApp,
             assert b"retry-after" in answer
         first.sendall(b"GET /healthz HTTP/1.1\r\nhost: x\r\n\r\n")
         assert first.recv(1000).startswith(b"HTTP/1.1 200")
+
+
+def test_far_too_many_connections_are_not_even_answered(make_app: MakeApp, run_app: Run) -> None:
+    running = run_app(make_app(max_connections=1))
+    with _connect(running), _connect(running) as told, _connect(running) as cut:
+        assert told.recv(1000).startswith(b"HTTP/1.1 503")
+        with contextlib.suppress(ConnectionResetError):
+            assert cut.recv(1000) == b""
+
+
+@pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system has no such limit")
+def test_the_system_gives_up_clients_that_are_gone(make_app: MakeApp, run_app: Run) -> None:
+    running = run_app(make_app(send_timeout=1.5))
+    with _connect(running):
+        (protocol,) = _wait(lambda: list(running.server.server_state.connections))
+        used = protocol.transport.get_extra_info("socket")
+        assert used.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 1500
 
 
 def test_a_refused_connection_can_be_read_after_a_long_body(make_app: MakeApp, run_app: Run) -> None:
@@ -373,6 +439,7 @@ class _Transport:
     """A transport whose client reads as a test says."""
 
     def __init__(self) -> None:
+        self.protocol = GuardedProtocol.__new__(GuardedProtocol)
         self.unread = 1000
         self.aborted = False
 
@@ -393,19 +460,23 @@ class _Loop:
     def time(self) -> float:
         return self.now
 
-    def call_later(self, seconds: float, function: Callable[..., None], *arguments: object) -> None:
+    def call_later(self, seconds: float, function: Callable[..., None], *arguments: object) -> _Loop:
         def later() -> None:
             self.now += seconds
             function(*arguments)
 
         self.later = later
+        return self
+
+    def cancel(self) -> None:
+        self.later = lambda: None
 
 
 @pytest.fixture
 def paused() -> tuple[_Transport, _Loop]:
     """The transport and the loop of a connection whose client does not read."""
-    protocol = GuardedProtocol.__new__(GuardedProtocol)
     transport, loop = _Transport(), _Loop()
+    protocol = transport.protocol
     protocol.transport, protocol.loop = transport, loop  # type: ignore[assignment]
     protocol.flow = FlowControl(transport)  # type: ignore[arg-type]
     protocol.pause_writing()
@@ -420,6 +491,15 @@ def test_a_client_that_reads_slowly_is_not_cut_off(paused: tuple[_Transport, _Lo
         assert not transport.aborted
     loop.later()
     assert transport.aborted
+
+
+def test_a_client_that_reads_again_is_watched_no_more(paused: tuple[_Transport, _Loop]) -> None:
+    transport, loop = paused
+    transport.protocol.resume_writing()
+    transport.unread = 0
+    loop.later()
+    assert not transport.aborted
+    assert loop.now == 0
 
 
 def test_a_client_that_takes_a_few_bytes_now_and_then_is_cut_off(paused: tuple[_Transport, _Loop]) -> None:
@@ -472,6 +552,18 @@ def test_an_image_that_waits_too_long_gets_503(
     assert json.load(answer)["error"]["code"] == "deadline"
     backend.gate.set()
     client.close()
+
+
+def test_while_it_drains_a_service_says_so_and_still_answers(make_app: MakeApp, run_app: Run, jpeg: bytes) -> None:
+    running = run_app(make_app(drain=2.0))
+    running.server.should_exit = True
+    _wait(lambda: running.app.service.draining)
+    for method, path, body, status in (("GET", "/readyz", None, 503), ("POST", "/v1/predict", jpeg, 200)):
+        client = http.client.HTTPConnection("127.0.0.1", running.port, timeout=20)
+        client.request(method, path, body=body)
+        answer = client.getresponse()
+        assert (answer.status, answer.will_close) == (status, True)
+        client.close()
 
 
 SCRIPT = """
@@ -579,12 +671,23 @@ logging.getLogger("PIL.TiffImagePlugin").debug("owner: secret")
     assert "corrupt EXIF" in entry["message"]
 
 
+@pytest.fixture
+def _far_east(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("TZ", "XYZ-9")
+    time.tzset()
+    yield
+    monkeypatch.undo()
+    time.tzset()
+
+
+@pytest.mark.usefixtures("_far_east")
 def test_log_lines_are_json_with_the_fields() -> None:
-    record = logging.makeLogRecord({"name": "a", "levelname": "INFO", "msg": "x %d", "args": (3,), "request_id": "7"})
+    fields = {"created": 1.25, "msecs": 250.0, "request_id": "7"}
+    record = logging.makeLogRecord({"name": "a", "levelname": "INFO", "msg": "x %d", "args": (3,), **fields})
     entry = json.loads(JsonFormatter().format(record))
     assert entry["message"] == "x 3"
     assert entry["request_id"] == "7"
-    assert entry["time"].endswith("Z")
+    assert entry["time"] == "1970-01-01T00:00:01.250Z"
     try:
         raise ValueError("two\nlines")
     except ValueError:
