@@ -341,7 +341,7 @@ def test_standard_input() -> None:
     assert done.stdout.decode().strip() == str([(i, "stdin", (96, 160, 3)) for i in range(3)])
 
 
-def test_a_piped_mp4_with_its_index_at_the_end_is_told_with_the_cure() -> None:
+def test_an_mp4_read_in_one_go_with_its_index_at_the_end_is_told_with_the_cure() -> None:
     buffer = io.BytesIO()
     with av.open(buffer, "w", format="mp4") as container:
         stream = container.add_stream("mpeg4", rate=10)
@@ -351,9 +351,14 @@ def test_a_piped_mp4_with_its_index_at_the_end_is_told_with_the_cure() -> None:
         for _ in range(20):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(noise.integers(0, 256, (192, 320, 3), np.uint8))))
         container.mux(stream.encode(None))
-    message = read_piped(buffer.getvalue()).stderr.decode().splitlines()[-1]
+    data = buffer.getvalue()
+    message = read_piped(data).stderr.decode().splitlines()[-1]
     assert "InputError: stdin: " in message
     assert "+faststart" in message
+    with Server([data] * 3, length=len(data)) as server:  # one that knows no parts of a file
+        (source,), _ = find_sources([server.url])
+        with pytest.raises(InputError, match=r"live\.ts: cannot be read in one go \(.*\+faststart"):
+            list(source)
 
 
 class Server:

@@ -62,6 +62,7 @@ _SLACK: Final = 1e-6
 """Seconds that a time stamp may be off by: a frame at 1/3 s is not before a start of 0.333333."""
 _WITH_LENGTH: Final = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "flv", "asf")
 """FFmpeg's names of the containers that state their length, which of others is found from what is there."""
+_INDEX_FIRST: Final = "its index comes first: ffmpeg -i IN -c copy -movflags +faststart OUT"
 _UNKNOWN: Final = 1 << 30
 """Frames that FFmpeg states in an AVI whose beginning it could not write again, as in a pipe."""
 _Decoded: TypeAlias = tuple[float, Callable[[], NDArray[np.uint8]]]
@@ -232,7 +233,7 @@ class VideoReader(FrameReader):
         self._timeout = timeout
         self._skipped = 0
         if self._path == "-":
-            self._cure = "; an MP4 can be piped if its index comes first: ffmpeg -i IN -c copy -movflags +faststart OUT"
+            self._cure = f"; an MP4 can be piped if {_INDEX_FIRST}"
         else:
             with self._open() as container:
                 stream = container.streams.video[0]
@@ -645,6 +646,8 @@ def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
                 raise InputError(f"{reader.name}: the stream broke ({error.strerror})") from error
             if "://" in reader.name and not isinstance(error, av.error.InvalidDataError):
                 reason = f"the connection was lost after {end:.1f} s ({error.strerror})"
+                if not end and "mp4" in container.format.name:
+                    reason = f"cannot be read in one go ({error.strerror}); an MP4 can if {_INDEX_FIRST}"
                 raise InputError(f"{reader.name}: {reason}") from error
             reader.broken += 1
             break
