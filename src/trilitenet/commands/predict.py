@@ -34,7 +34,7 @@ from trilitenet.errors import (
     replacing,
     writing,
 )
-from trilitenet.formats.writers.base import Writer, find_writer, open_writer, uninterrupted
+from trilitenet.formats.writers.base import Writer, file_stem, find_writer, open_writer, uninterrupted
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, Failure, FrameReader, Stills, find_sources
 from trilitenet.inference.video import PerceptionStream, VideoWriter
@@ -594,7 +594,7 @@ def _numbered(file: str) -> str:
 def _allot_stems(names: Sequence[str]) -> dict[str, str]:
     """Return a file name without ending for each source; the second ``a`` becomes ``a-2``."""
     free = FreeNames(files=True)
-    return {name: free.give(PurePath(name).stem or "image") for name in dict.fromkeys(names)}
+    return {name: free.give(file_stem(name)) for name in dict.fromkeys(names)}
 
 
 def _write_jpeg(path: Path, image: NDArray[np.uint8]) -> None:

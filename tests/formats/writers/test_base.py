@@ -266,9 +266,19 @@ def test_a_first_frame_that_cannot_be_written_replaces_nothing(
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_a_source_that_ends_in_no_name_is_an_image(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("source", "stem"),
+    [
+        ("/", "image"),
+        ("frames/a.b.jpg", "a.b"),
+        ("rtsp://10.0.0.1:8554/front.sdp", "front"),
+        ("rtsp://10.0.0.1", "10.0.0.1"),
+        ("udp://10.0.0.1:1234", "10.0.0.1-1234"),
+    ],
+)
+def test_files_are_called_as_their_source(tmp_path: Path, source: str, stem: str) -> None:
     with open_writer("coco", tmp_path) as writer:
-        assert writer.stem("/") == "image"
+        assert writer.stem(source) == stem
 
 
 def test_a_folder_of_that_name_is_not_replaced(tmp_path: Path) -> None:

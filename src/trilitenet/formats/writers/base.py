@@ -34,7 +34,7 @@ from trilitenet.structures import Perception
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["WRITERS", "GrowingFile", "JsonStream", "Writer", "find_writer", "open_writer", "uninterrupted"]
+__all__ = ["WRITERS", "GrowingFile", "JsonStream", "Writer", "file_stem", "find_writer", "open_writer", "uninterrupted"]
 
 WRITERS: Final[dict[str, str]] = {
     "json": "trilitenet.formats.writers.native:JsonWriter",
@@ -184,7 +184,7 @@ class Writer(abc.ABC):
             self._unnamed += 1
             return f"image-{self._unnamed:06d}"
         if source not in self._stems:
-            self._stems[source] = self._free.give(PurePath(source).stem or "image")
+            self._stems[source] = self._free.give(file_stem(source))
             self._names[PurePath(source).name] += 1
         return self._stems[source]
 
@@ -217,6 +217,14 @@ def open_writer(format: str, output: str | Path, *, overwrite: bool = False, **o
         MissingExtraError: If the format needs a package that is not installed.
     """
     return find_writer(format)(Path(output), overwrite=overwrite, **options)
+
+
+def file_stem(source: str) -> str:
+    """Return a source's name as that of a file without ending: of a URL without a path its whole address."""
+    path = PurePath(source)
+    if "://" in source and len(path.parts) == 2:
+        return path.name.replace(":", "-")
+    return path.stem or "image"
 
 
 def find_writer(format: str) -> type[Writer]:
