@@ -502,6 +502,25 @@ def test_a_clip_is_seen_in_chunks_with_progress(page: Page, server: Running, cli
     assert page.downloaded("drive.webm").read_bytes()[:4] == b"\x1a\x45\xdf\xa3"
 
 
+def test_a_clip_plays_at_its_speed_however_often_it_is_paused(page: Page, clip: Path) -> None:
+    page.script("document.getElementById('rate').value = '2'")
+    page.choose(clip)
+    page.wait(lambda: page["player"].is_displayed() and not page["progress-row"].is_displayed())
+    page.wait(lambda: page["seek-text"].text.startswith("1 /"))
+    milliseconds = page.driver.execute_async_script(
+        "const [done] = arguments; const start = performance.now(); const seek = document.getElementById('seek');"
+        "for (let i = 0; i < 3; i += 1) document.getElementById('play').click();"
+        "(function look() { seek.value >= 4 ? done(performance.now() - start) : setTimeout(look, 5); })()"
+    )
+    assert milliseconds > 1900  # four frames at two a second
+    page.set_range("seek", 0)
+    page["play"].click()
+    assert page["play"].text == "Pause"
+    page["save-clip"].click()
+    assert page["play"].text == "Play"  # else it would change what is recorded
+    page.downloaded("drive.webm")
+
+
 def test_frames_for_which_there_was_no_time_are_asked_for_again(
     page: Page, server: Running, clip: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,7 +19,7 @@ let current = null; // the prepared frame on the canvas
 let position = 0;
 let rate = 5;
 let fileName = "picture";
-let playing = false;
+let player = null; // what plays the clip, until it is paused
 let work = null; // AbortController of what runs now
 let met = null; // promise of what the service says of its model
 let retry = null; // what to do again once there is a token
@@ -155,8 +155,7 @@ function setSlider(slider, value) {
 /** Run a job; another one stops it. Errors are shown, and a missing token is asked for. */
 async function run(job) {
   work?.abort();
-  playing = false;
-  element("play").textContent = "Play";
+  stopPlaying();
   const mine = new AbortController();
   work = mine;
   showError("");
@@ -253,16 +252,21 @@ async function seeCamera(signal) {
 
 // ---------------------------------------------------------------------------------------------- playing and saving
 
-async function play() {
-  playing = !playing;
-  element("play").textContent = playing ? "Pause" : "Play";
-  if (playing && position === frames.length - 1) await showFrame(0, false);
-  while (playing && position < frames.length - 1) {
-    await pause(1000 / rate);
-    if (playing) await showFrame(position + 1, false);
-  }
-  playing = false;
+function stopPlaying() {
+  player = null;
   element("play").textContent = "Play";
+}
+
+async function play() {
+  if (player) return stopPlaying();
+  const mine = (player = {});
+  element("play").textContent = "Pause";
+  if (position === frames.length - 1) await showFrame(0, false);
+  while (player === mine && position < frames.length - 1) {
+    await pause(1000 / rate);
+    if (player === mine) await showFrame(position + 1, false);
+  }
+  if (player === mine) stopPlaying();
 }
 
 function save(blob, suffix) {
@@ -286,6 +290,7 @@ function saveJson() {
 }
 
 async function saveClip() {
+  stopPlaying();
   const button = element("save-clip");
   button.disabled = true;
   const recorder = new MediaRecorder(view.captureStream());
@@ -326,7 +331,7 @@ element("stop").addEventListener("click", () => {
 });
 element("play").addEventListener("click", play);
 element("seek").addEventListener("input", (event) => {
-  playing = false;
+  stopPlaying();
   showFrame(Number(event.target.value));
 });
 element("save-overlay").addEventListener("click", () => view.toBlob((blob) => save(blob, "-overlay.png"), "image/png"));
