@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -68,6 +69,27 @@ def test_every_command_takes_texts(
     monkeypatch.chdir(tmp_path)
     with pytest.raises(TriLiteNetError):
         call()
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda network: trilitenet.load(network),
+        lambda network: trilitenet.load_network(network),
+        lambda network: trilitenet.benchmark(network),
+        lambda network: trilitenet.export(network),
+        lambda network: evaluate(network, data="nowhere"),
+        lambda network: evaluate_table(network, data="nowhere", output="x", precisions=["fp32"]),
+    ],
+)
+def test_a_network_in_place_of_its_file_is_told_by_its_type(call: Callable[[Any], object]) -> None:
+    with pytest.raises(TypeError, match=r"expected str, bytes or os\.PathLike object, not TriLiteNet"):
+        call(trilitenet.build_network("tiny"))
+
+
+def test_a_list_in_place_of_sources_is_told_by_its_type(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match=r"expected str, bytes or os\.PathLike object, not list"):
+        predict(["a.jpg"], output=tmp_path)  # type: ignore[arg-type]
 
 
 def test_a_report_that_cannot_be_written_is_told_before_the_work(tmp_path: Path) -> None:

@@ -204,7 +204,7 @@ def benchmark(
         if table == "cost":
             result = Benchmark((), _costs(size), machine, 0, None)
         else:
-            for name, one in itertools.product(map(str, models or ("tiny",)), backend):
+            for name, one in itertools.product([os.fspath(model) for model in models or ("tiny",)], backend):
                 entry = _Entry(name, one, device, streams, threads)
                 stack.enter_context(entry.predictor)
                 calls += [_Call(entry, count, stage, size, source) for count in batch]

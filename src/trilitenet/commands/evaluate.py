@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -91,7 +92,7 @@ def evaluate(
             protocol decides.
         OutputError: If there is a report already.
     """
-    model, data, output, save = str(model), Path(data), optional_path(output), optional_path(save)
+    model, data, output, save = os.fspath(model), Path(data), optional_path(output), optional_path(save)
     check_counts(resamples, worst, limit, paper_batch, batch_size)
     if not severities or not set(severities) <= set(SEVERITIES):
         raise ConfigError(f"--severities must be of 1 to 5, got {', '.join(map(str, severities)) or 'none'}")

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import hashlib
 import math
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -170,7 +171,7 @@ def evaluate_table(
         int8 += "" if max_drop is None else f"-drop{max_drop:g}"
     rows: list[PrecisionRow] = []
     hashes: dict[tuple[str, ...], dict[str, str]] = {}  # the classes decide what labels mean
-    for model in map(str, models or VARIANTS):
+    for model in [os.fspath(model) for model in models or VARIANTS]:
         classes = read_card(model).class_names
         if classes not in hashes:
             hashes[classes] = hash_dataset(DrivingDataset(data, split, class_names=classes), limit)

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import io
 import math
+import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -167,7 +168,7 @@ def export(
         OutputError: If a file of the artefact exists (told before the work begins), or cannot be written.
         BackendError: If the comparison fails.
     """
-    model, output, calibration, frames = str(model), *map(optional_path, (output, calibration, frames))
+    model, output, calibration, frames = os.fspath(model), *map(optional_path, (output, calibration, frames))
     portable = portable or format in ("ncnn", "tensorrt")
     parsed = _parse_size(size)
     _check_options(

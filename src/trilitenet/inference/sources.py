@@ -476,7 +476,7 @@ def find_sources(
             failures.append(Failure(_without_secrets(name), str(error)))
 
     taken: set[Path] = set()
-    for name in dict.fromkeys(map(str, names)):
+    for name in dict.fromkeys(os.fspath(name) for name in names):
         if re.match(r"[a-z][a-z0-9+.-]+://", name, re.IGNORECASE):
             add(functools.partial(_open_url, name, clip), name)
         elif name == "-" or (name == "stdin" and not Path(name).exists()):
