@@ -137,6 +137,12 @@ def test_anchors_may_be_a_tensor_an_array_or_lists_and_are_kept_as_numbers(kind:
     assert build_network("tiny", np.int64(2), anchors=kind(DEFAULT_ANCHORS)).card.anchors == DEFAULT_ANCHORS
 
 
+def test_type_checkers_take_anchors_as_lists_and_as_arrays() -> None:  # mypy looks at the calls, as at a user's
+    lists = [[(8, 6), [16, 12.5], (22, 18)]] * 3
+    array = np.array(lists)
+    assert build_network("tiny", anchors=lists).card.anchors == build_network("tiny", anchors=array).card.anchors
+
+
 def test_decode_by_hand() -> None:
     """One hot cell a level, worked out by the formulas of `decode_level`; order: level, anchor, row, column."""
     network = build_network("tiny", anchors=(((8, 6),) * 3, ((30, 20),) * 3, ((90, 60),) * 3))

@@ -10,9 +10,10 @@ import functools
 import numbers
 import re
 from collections.abc import Iterable, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from trilitenet.config import (
@@ -22,7 +23,6 @@ from trilitenet.config import (
     MAX_STRIDE,
     STRIDES,
     TASKS,
-    Anchors,
     ModelCard,
     Task,
     check_anchors,
@@ -37,6 +37,9 @@ from trilitenet.models.encoder import Encoder
 from trilitenet.models.segmentation import SegmentationHead
 
 __all__ = ["NetworkOutputs", "TriLiteNet", "build_network", "foreign_layers", "normalise_images"]
+
+AnchorsLike: TypeAlias = Sequence[Sequence[Sequence[float]]] | NDArray[Any] | Tensor
+"""(width, height) in input pixels, three a level, as lists or tuples, array or tensor."""
 
 
 class NetworkOutputs(NamedTuple):
@@ -74,7 +77,7 @@ class TriLiteNet(nn.Module):
         classes: int,
         tasks: tuple[Task, ...],
         blocks: tuple[str, ...],
-        anchors: Anchors,
+        anchors: AnchorsLike,
     ) -> None:
         super().__init__()
         anchors = check_anchors(anchors)
@@ -161,7 +164,7 @@ def build_network(
     pcaa: bool = True,
     litepan: bool = True,
     spp: bool = True,
-    anchors: Anchors | Tensor | None = None,
+    anchors: AnchorsLike | None = None,
 ) -> TriLiteNet:
     """Build the network with fresh random weights.
 
