@@ -244,6 +244,7 @@ def test_import_refuses_what_is_not_a_checkpoint(golden: dict[str, NDArray[Any]]
     torch.save({"conv.weight": torch.zeros(1)}, tmp_path / "foreign.pth")
     torch.save({k: v for k, v in state.items() if "caam.fuse" not in k}, tmp_path / "missing.pth")
     torch.save({**state, "model.9.weight": torch.zeros(1)}, tmp_path / "surplus.pth")
+    torch.save({**state, "module.model.2.m.0.bias": state["model.2.m.0.bias"] + 1}, tmp_path / "mixed.pth")
     torch.save({k: v for k, v in state.items() if "anchor_grid" not in k}, tmp_path / "anchors.pth")
     cases = {
         "cut.pth": "truncated",
@@ -256,6 +257,7 @@ def test_import_refuses_what_is_not_a_checkpoint(golden: dict[str, NDArray[Any]]
         "foreign.pth": "not a published TriLiteNet checkpoint",
         "missing.pth": "missing pcaa.fuse",
         "surplus.pth": "surplus model.9",
+        "mixed.pth": "surplus module.model.2.m.0.bias",
         "anchors.pth": "missing model.2.anchor_grid",
         "absent.pth": "does not exist",
     }
