@@ -56,6 +56,26 @@ def test_a_drifting_predictor_scores_less_and_its_interval_holds_the_value() -> 
     assert report.protocols == ("fair", "paper")
 
 
+class _DoubledMasks(FakeBackend):
+    """As an artefact of --mask-scale 2."""
+
+    def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
+        raw = super().run(batch)
+        assert raw.drivable is not None
+        assert raw.lane is not None
+        drivable, lane = (mask.repeat(2, 1).repeat(2, 2) for mask in (raw.drivable, raw.lane))
+        return RawOutputs(raw.detection, drivable, lane)
+
+
+def test_masks_that_a_backend_enlarges_count_in_both_protocols() -> None:
+    images = Images(4)
+    predictors = FakePredictor(_DoubledMasks(images)), fake_predictor(images)
+    doubled, plain = (values(evaluate(one, images, protocol="both", resamples=0)) for one in predictors)
+    assert doubled["fair/lane/iou"] == 1
+    for key in ("paper/drivable/miou", "paper/lane/iou"):
+        assert doubled[key] == pytest.approx(plain[key], abs=0.01)
+
+
 @pytest.mark.parametrize("protocol", ["fair", "paper"])
 def test_figures_do_not_hang_on_the_batch_size(protocol: str) -> None:
     images = Images()

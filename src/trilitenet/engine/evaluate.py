@@ -380,8 +380,8 @@ def _argmax(
     """Decide by the likelier of the two classes, padding cropped, at the size the image has in the published canvas."""
     if masks is None:
         return None
-    inside = masks[index][letterbox.inside]
-    if letterbox.resized != published.resized:
+    inside = letterbox.crop(masks[index])
+    if inside.shape != published.resized:
         inside = cv2.resize(inside, published.resized[::-1], interpolation=cv2.INTER_LINEAR)
     return np.asarray(inside > 127)
 

@@ -176,14 +176,28 @@ class Letterbox:
         Raises:
             ShapeError: If the mask is of another size or type.
         """
+        inside = self.crop(mask)
+        if inside.shape == self.source:
+            return np.array(inside)
+        return np.asarray(cv2.resize(inside, self.source[::-1], interpolation=cv2.INTER_LINEAR), np.uint8)
+
+    def crop(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the part of a mask that the image has inside the canvas, without padding.
+
+        Args:
+            mask: As `mask_to_source` takes it.
+
+        Returns:
+            A view of it: (height, width) uint8 of the resized size, or of the same multiple of that.
+
+        Raises:
+            ShapeError: If the mask is of another size or type.
+        """
         scale = mask.shape[0] // self.canvas[0]
         if scale < 1 or mask.shape != (scale * self.canvas[0], scale * self.canvas[1]) or mask.dtype != np.uint8:
             raise ShapeError(f"mask must be {self.canvas} uint8, got {mask.shape} {mask.dtype}")
         rows, columns = (slice(scale * part.start, scale * part.stop) for part in self.inside)
-        inside: NDArray[np.uint8] = mask[rows, columns]
-        if inside.shape == self.source:
-            return np.array(inside)
-        return np.asarray(cv2.resize(inside, self.source[::-1], interpolation=cv2.INTER_LINEAR), np.uint8)
+        return mask[rows, columns]
 
     def _resize(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if self.resized == self.source:
