@@ -143,6 +143,13 @@ def test_type_checkers_take_anchors_as_lists_and_as_arrays() -> None:  # mypy lo
     assert build_network("tiny", anchors=lists).card.anchors == build_network("tiny", anchors=array).card.anchors
 
 
+def test_shapes_are_told_without_computing() -> None:
+    with torch.device("meta"):
+        outputs = build_network("base").train()(torch.zeros(2, 3, 64, 96))
+    assert outputs.lane is not None
+    assert outputs.lane.shape == (2, 2, 64, 96)
+
+
 def test_decode_by_hand() -> None:
     """One hot cell a level, worked out by the formulas of `decode_level`; order: level, anchor, row, column."""
     network = build_network("tiny", anchors=(((8, 6),) * 3, ((30, 20),) * 3, ((90, 60),) * 3))

@@ -60,7 +60,7 @@ class Encoder(nn.Module):
         kind = image.device.type
         # While training, the stem is exact: what bf16 rounds off pixels and first maps, every gradient misses. It is
         # most of the difference between gradients in bf16 and in fp32, for a few per cent of time (docs/training.md).
-        exact = self.training and torch.is_autocast_enabled(kind)
+        exact = self.training and torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind)
         with torch.autocast(kind, enabled=False) if exact else nullcontext():
             image = image.float() if exact else image
             i1 = self.pool(image)
