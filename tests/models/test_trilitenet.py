@@ -101,7 +101,16 @@ def test_any_multiple_of_32_is_a_legal_size(size: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize(
-    "shape", [(1, 3, 360, 640), (3, 384, 640), (1, 1, 64, 64), (1, 384, 640, 3), (0, 3, 64, 64), (1, 3, 0, 64)]
+    "shape",
+    [
+        (1, 3, 360, 640),
+        (1, 3, 384, 624),
+        (3, 384, 640),
+        (1, 1, 64, 64),
+        (1, 384, 640, 3),
+        (0, 3, 64, 64),
+        (1, 3, 0, 64),
+    ],
 )
 def test_any_other_shape_is_a_clear_error(shape: tuple[int, ...]) -> None:
     with pytest.raises(ShapeError, match="multiples of 32"):

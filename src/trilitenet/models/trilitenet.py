@@ -98,7 +98,7 @@ class TriLiteNet(nn.Module):
         self.reduce = ConvBNPReLU(c4, c2) if segments else None
         self.drivable = SegmentationHead(c0, c1, c2) if "drivable" in tasks else None
         self.lane = SegmentationHead(c0, c1, c2) if "lane" in tasks else None
-        self.register_buffer("anchors", torch.as_tensor(anchors, dtype=torch.float32).clone().view(len(STRIDES), -1, 2))
+        self.register_buffer("anchors", torch.tensor(anchors, dtype=torch.float32))
         self.card = ModelCard(
             variant=variant,
             class_names=("vehicle",) if classes == 1 else tuple(f"class_{i}" for i in range(classes)),
