@@ -234,7 +234,7 @@ def score_predictions(
         canvases[letterbox.canvas] = None
         scorecard.add(
             sample,
-            perception if "fair" in scorecard.protocols else None,
+            perception,
             _saved_on_canvas(perception, letterbox) if "paper" in scorecard.protocols else None,
         )
         if progress is not None:
@@ -479,7 +479,7 @@ def _best_cut(counts: NDArray[np.int64], default: float) -> tuple[float, float]:
 
 def _best_confidence(detection: DetectionMetric, default: float) -> tuple[float, float]:
     curve, best = detection.curve(), detection.compute().best
-    if not len(curve.confidence) or np.isnan(best.f1):
+    if np.isnan(best.f1):
         return default, float("nan")
     at = int(np.flatnonzero(curve.confidence == best.confidence)[0])
     below = curve.confidence[at + 1] if at + 1 < len(curve.confidence) else 0.0
