@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import time
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -98,15 +98,21 @@ def test_predictions_are_handed_on_in_order_at_the_images_own_size() -> None:
         assert prediction.size == sample.size
         seen.append(sample.name)
 
-    evaluate(fake_predictor(images), images, resamples=0, limit=7, on_prediction=look)
-    assert seen == [f"{index:03d}" for index in range(7)]
+    for protocol in ("fair", "paper"):
+        evaluate(fake_predictor(images), images, protocol=protocol, resamples=0, limit=7, on_prediction=look)
+    assert seen == [f"{index:03d}" for index in range(7)] * 2
 
 
 def test_the_image_is_changed_for_the_network_alone() -> None:
     images = Images()
-    report = evaluate(
-        fake_predictor(images), images, resamples=0, change=lambda image, name: image // np.array([4, 1, 1], np.uint8)
-    )
+    names = []
+
+    def change(image: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+        names.append(name)
+        return image // np.array([4, 1, 1], np.uint8)
+
+    report = evaluate(fake_predictor(images), images, resamples=0, change=change)
+    assert names == [f"{index:03d}" for index in range(12)]
     assert values(report)["fair/drivable/iou"] == 0.0
     assert values(report)["fair/lane/iou"] == 1.0
 
@@ -160,8 +166,13 @@ def test_saved_predictions_score_as_the_predictor_did(tmp_path: Path) -> None:
     saved = score_predictions(SavedPredictions(tmp_path, ("vehicle",)), images, confidence=0.3, resamples=0)
     assert values(saved) == pytest.approx(values(report), abs=1e-9)
     assert saved.provenance.runtime == "saved predictions"
-    both = score_predictions(SavedPredictions(tmp_path, ("vehicle",)), images, protocol="both", resamples=0)
+    again = SavedPredictions(tmp_path, ("vehicle",))
+    both = score_predictions(again, images, protocol="both", confidence=0.5, paper_batch=5, resamples=0)
     assert values(both)["paper/drivable/miou"] > 0.8
+    assert both.fair is not None
+    assert both.fair.detection is not None
+    assert both.fair.detection.at.confidence == 0.5
+    assert both.provenance.settings["paper_batch"] == 5
 
 
 def test_the_best_thresholds_are_found_in_one_pass() -> None:
@@ -221,11 +232,18 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
     predictor = fake_predictor(images)
     with pytest.raises(ConfigError, match="unknown protocol 'unfair'"):
         evaluate(predictor, images, protocol="unfair")
-    with pytest.raises(DataError, match="no images"):
-        evaluate(predictor, images, limit=0)
+    for limit, batch_size in ((0, 1), (None, 0)):
+        with pytest.raises(DataError, match="no images to evaluate on"):
+            best_thresholds(predictor, images, limit=limit, batch_size=batch_size)
     images.class_names = ("car", "bus")
     with pytest.raises(ConfigError, match="the model has classes vehicle, the labels car, bus"):
         evaluate(predictor, images)
+    predictor.backend.card = dataclasses.replace(predictor.backend.card, class_names=("car", "bus"))
+    images.class_names = ("vehicle",)
+    with pytest.raises(ConfigError, match="the model has classes car, bus, the labels vehicle"):
+        evaluate(predictor, images)
+    predictor.backend.card = dataclasses.replace(predictor.backend.card, tasks=("drivable", "lane"))
+    assert evaluate(predictor, images, resamples=0).fair is not None  # its classes tell nothing
 
 
 def test_an_error_while_reading_is_the_callers() -> None:
@@ -365,8 +383,10 @@ def test_thresholds_are_not_told_from_what_does_not_count() -> None:
 def test_the_best_threshold_lies_just_below_the_best_value() -> None:
     images = Images()
     predictor = fake_predictor(images)
-    make_unsure(predictor, 80, 79)
-    predictor.thresholds = best_thresholds(predictor, images).thresholds
+    make_unsure(predictor, 100, 99)
+    best = best_thresholds(predictor, images)
+    assert best.drivable_iou == 1.0
+    predictor.thresholds = best.thresholds
     assert values(evaluate(predictor, images, resamples=0))["fair/drivable/iou"] == 1.0
 
 
@@ -392,3 +412,145 @@ def test_a_single_class_may_be_called_otherwise_by_the_labels() -> None:
     assert scores is not None
     assert scores.detection is not None
     assert scores.detection.ap50 == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("confidence", "lowest"), [(0.3, 0.001), (0.0, 0.0)])
+def test_average_precision_needs_doubtful_boxes_too(confidence: float, lowest: float) -> None:
+    images = Images(3)
+    for score, found in ((lowest + 0.0005, 1.0), (lowest - 0.0005, 0.0)):
+        predictor = fake_predictor(images)
+        predictor.thresholds = Thresholds(confidence=confidence)
+        run = predictor.backend.run
+
+        def doubt(batch: np.ndarray, run: Callable[..., RawOutputs] = run, score: float = score) -> RawOutputs:
+            raw = run(batch)
+            assert raw.detection is not None
+            raw.detection[:, :3, 4:] = np.sqrt(max(score, 0))
+            return raw
+
+        predictor.backend.run = doubt  # type: ignore[method-assign]
+        scores = evaluate(predictor, images, resamples=0).fair
+        assert scores is not None
+        assert scores.detection is not None
+        assert scores.detection.recall_all == found
+        assert scores.detection.at.recall == (found if score > confidence else 0.0)
+
+
+@pytest.mark.parametrize(
+    ("long_side", "inside", "outside", "iou"),
+    [(640, 128, 127, 1.0), (320, 255, 0, 1.0), (320, 130, 0, 179 / 180)],  # the last loses a row between pixels
+)
+def test_the_paper_protocol_takes_the_likelier_class_without_padding(
+    long_side: int, inside: int, outside: int, iou: float
+) -> None:
+    images = Images(1)
+    drivable = np.zeros((360, 640), np.uint8)
+    drivable[180:] = 1
+    image = np.stack([drivable * 255, np.zeros_like(drivable), np.zeros_like(drivable)], axis=2)
+    images._samples = [dataclasses.replace(images[0], image=image, drivable=drivable, lane=None)]
+    predictor = fake_predictor(images)
+    predictor.long_side = long_side
+
+    def run(batch: np.ndarray) -> RawOutputs:
+        masks = np.where(batch[..., 0] == 255, inside, outside).astype(np.uint8)
+        return RawOutputs(None, np.where(batch[..., 0] == 114, np.uint8(255), masks), None)  # the padding is foreground
+
+    predictor.backend.run = run  # type: ignore[method-assign]
+    report = evaluate(predictor, images, protocol="paper", resamples=0)
+    assert values(report)["paper/drivable/iou"] == iou
+
+
+def test_the_best_confidence_lies_half_way_to_nothing_below_the_last_box() -> None:
+    images = Images(3)
+    predictor = fake_predictor(images)
+    run = predictor.backend.run
+
+    def doubt(batch: np.ndarray) -> RawOutputs:
+        raw = run(batch)
+        assert raw.detection is not None
+        raw.detection[:, :3, 4:] = np.sqrt(0.1)
+        return dataclasses.replace(raw, detection=raw.detection[:, :3])
+
+    predictor.backend.run = doubt  # type: ignore[method-assign]
+    best = best_thresholds(predictor, images)
+    assert best.detection_f1 == 1.0
+    assert best.thresholds.confidence == pytest.approx(0.05)  # half way to nothing
+
+
+def test_thresholds_of_what_a_network_has_not_or_never_finds_stay() -> None:
+    images = Images(2)
+    predictor = fake_predictor(images)
+    find = predictor.backend.run
+
+    def find_nothing(batch: np.ndarray) -> RawOutputs:
+        return RawOutputs(np.zeros((len(batch), 1, 6), np.float32), None, None)
+
+    predictor.backend.run = find_nothing  # type: ignore[method-assign]
+    best = best_thresholds(predictor, images)
+    assert best.thresholds == predictor.thresholds
+    assert np.isnan([best.drivable_iou, best.lane_iou]).all()
+    predictor.backend.run = lambda batch: dataclasses.replace(find(batch), drivable=None)  # type: ignore[method-assign]
+    empty = Images(2)
+    empty._samples = [
+        dataclasses.replace(sample, boxes=np.zeros((0, 4), np.float32), class_id=np.zeros(0, np.int64))
+        for sample in images._samples
+    ]
+    best = best_thresholds(predictor, empty)  # boxes, and no object
+    assert best.thresholds.confidence == 0.3
+    assert np.isnan(best.detection_f1)
+
+
+def test_each_mask_has_its_own_threshold() -> None:
+    images = Images(3)
+    predictor = fake_predictor(images)
+    predictor.thresholds = Thresholds(drivable=0.9, lane=0.2)
+    run = predictor.backend.run
+
+    def unsure(batch: np.ndarray) -> RawOutputs:
+        raw = run(batch)
+        assert raw.drivable is not None
+        assert raw.lane is not None
+        return dataclasses.replace(raw, drivable=raw.drivable // 2, lane=raw.lane // 2)
+
+    predictor.backend.run = unsure  # type: ignore[method-assign]
+    found = values(evaluate(predictor, images, resamples=0))
+    assert (found["fair/drivable/iou"], found["fair/lane/iou"]) == (0.0, 1.0)
+
+
+def test_neighbours_of_other_shapes_share_no_batch() -> None:
+    images = Images(2)
+    turned = images[1]
+    assert turned.drivable is not None
+    images._samples[1] = dataclasses.replace(
+        turned, image=np.zeros((96, 64, 3), np.uint8), boxes=None, class_id=None, drivable=None, lane=None
+    )
+    predictor = fake_predictor(images)
+    run, shapes = predictor.backend.run, []
+
+    def look(batch: np.ndarray) -> RawOutputs:
+        shapes.append(batch.shape[:3])
+        return run(batch) if batch.shape[1] == 64 else RawOutputs(None, None, None)
+
+    predictor.backend.run = look  # type: ignore[method-assign]
+    evaluate(predictor, images, resamples=0, batch_size=2)
+    assert shapes == [(1, 64, 96), (1, 96, 64)]
+
+
+def test_saved_boxes_count_in_the_paper_protocol_as_those_of_a_network_do(tmp_path: Path) -> None:
+    images = Images(1)
+    assert images[0].boxes is not None
+    right = Boxes(images[0].boxes[:1], np.array([0.5], np.float32), np.zeros(1, np.int64))
+
+    def recall(scores: float, count: int) -> dict[str, float]:
+        wrong = np.tile(np.array([[90, 40, 95, 45]], np.float32), (count, 1))
+        confidence = np.append(right.confidence, np.full(count, scores, np.float32))
+        order = np.argsort(-confidence, kind="stable")
+        boxes = Boxes(np.concatenate([right.xyxy, wrong])[order], confidence[order], np.zeros(count + 1, np.int64))
+        with PredictionWriter(tmp_path, ("detection",), overwrite=True) as writer:
+            writer.write("000", Perception(size=images[0].size, boxes=boxes))
+        saved = SavedPredictions(tmp_path, ("vehicle",))
+        return values(score_predictions(saved, images, protocol="paper", resamples=0))
+
+    assert recall(0.0005, 3)["paper/detection/precision"] == 1.0  # not above the published confidence
+    assert recall(0.9, 299)["paper/detection/recall"] == pytest.approx(1 / 3)
+    assert recall(0.9, 300)["paper/detection/recall"] == 0.0  # 300 boxes an image count
