@@ -46,6 +46,16 @@ def test_of_images_as_bad_the_one_with_more_errors_is_the_worse() -> None:
         assert [frame.name for frame in scores.report(nothing, resamples=0).worst] == [kept]
 
 
+def test_images_without_lanes_that_none_are_seen_on_are_not_among_the_worst() -> None:
+    scores = Scorecard(("vehicle",), ("lane",), worst=3)
+    lane = np.zeros(SIZE, np.uint8)
+    lane[:, 30:34] = 1
+    for name, truth in (("empty", np.zeros_like(lane)), ("missed", lane), ("also empty", np.zeros_like(lane))):
+        sample = Sample(name, np.zeros((*SIZE, 3), np.uint8), lane=truth)
+        scores.add(sample, Perception(SIZE, lane=np.zeros(SIZE, np.bool_)), None)
+    assert [(frame.name, frame.score) for frame in scores.report(nothing, resamples=0).worst] == [("missed", 0.0)]
+
+
 def test_of_images_that_are_alike_the_first_are_kept() -> None:
     report = evaluate(fake_predictor(Images()), Images(), resamples=0, worst=3)
     names = [(frame.task, frame.name) for frame in report.worst]
