@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,10 +15,10 @@ import pytest
 from tests.artefacts import Artefacts
 from trilitenet.apps.cli import main
 from trilitenet.commands.compare import compare
-from trilitenet.commands.evaluate import _resized, check_output, evaluate, hash_dataset, hash_model
+from trilitenet.commands.evaluate import _check_artefact, _resized, check_output, evaluate, hash_dataset, hash_model
 from trilitenet.commands.load import load
 from trilitenet.commands.score import score
-from trilitenet.config import ARTEFACT_KEY, ModelCard
+from trilitenet.config import ARTEFACT_KEY, ArtefactInfo, ModelCard, Thresholds
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.synthetic_files import write_dataset
 from trilitenet.engine.provenance import hash_files
@@ -96,6 +98,11 @@ def test_the_weights_beside_a_graph_are_part_of_its_hash(tmp_path: Path) -> None
         before = hash_model(str(path))
         path.with_suffix(".bin").write_bytes(b"others")
         assert hash_model(str(path)) not in (before, None)
+    before = hash_model(str(path))
+    path.with_suffix(".json").write_text("{}")  # NCNN's card
+    assert hash_model(str(path)) not in (before, None)
+    (tmp_path / "a.xml").unlink()
+    assert hash_model(str(tmp_path / "a.xml")) is None
     before = hash_model(str(tmp_path))
     (tmp_path / "a.ncnn.bin").write_bytes(b"yet others")
     assert hash_model(str(tmp_path)) not in (before, None)
@@ -121,6 +128,9 @@ def test_reports_are_compared(run: tuple[Report, Path], data: Path, tmp_path: Pa
         compare()
     with pytest.raises(ConfigError, match=r"report\.json: given more than once"):
         compare(folder, tmp_path / "scored", folder / "report.json")
+    shutil.copyfile(folder / "report.json", tmp_path / "report.json")
+    twice = compare(folder, tmp_path / "report.json", resamples=0)
+    assert twice.names == ("tiny.safetensors", f"tiny.safetensors ({tmp_path / 'report.json'})")
 
 
 def test_reports_are_not_overwritten_unasked(run: tuple[Report, Path], data: Path, weights: Path) -> None:
@@ -199,6 +209,7 @@ def test_negative_counts_are_refused_before_the_work(
         ({"corruptions": True, "severities": (3, 6)}, "--severities must be of 1 to 5, got 3, 6"),
         ({"corruptions": True, "severities": ()}, "--severities must be of 1 to 5, got none"),
         ({"batch_size": 0}, "--batch-size must be at least 1, got 0"),
+        ({"paper_batch": 0}, "--paper-batch must be at least 1, got 0"),
     ],
 )
 def test_what_comes_after_the_first_pass_is_refused_before_it(
@@ -312,3 +323,62 @@ def test_the_hash_of_the_data_is_of_the_images_measured_on(data: Path) -> None:
     dataset = DrivingDataset(data, "val")
     few = DrivingDataset(data, "val", names=dataset.names[:2])
     assert hash_dataset(dataset, 2) == hash_dataset(few) != hash_dataset(dataset)
+
+
+def test_what_is_asked_of_a_measurement_reaches_every_pass(
+    run: tuple[Report, Path], data: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[dict[str, Any]] = []
+
+    def note(_predictor: object, _dataset: object, _report: object = None, **options: Any) -> Any:
+        given.append(options)
+        return run[0] if len(given) == 1 else ()
+
+    for name in ("run_evaluation", "corrupted_figures", "figures_by_size"):
+        monkeypatch.setattr(f"trilitenet.commands.evaluate.{name}", note)
+    each: dict[str, Any] = {"protocol": "both", "batch_size": 2, "limit": 3, "paper_batch": 5}
+    once: dict[str, Any] = {"resamples": 7, "worst": 2, "by": ("scene",)}
+    evaluate(weights, data=data, corruptions=True, severities=(2,), resolution=(96,), **each, **once)
+    assert len(given) == 3
+    assert all(options.items() >= each.items() and options["progress"] is not None for options in given)
+    assert given[0].items() >= once.items()
+    assert given[1]["severities"] == (2,)
+
+
+def test_what_is_asked_of_a_score_reaches_it(
+    run: tuple[Report, Path], data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[dict[str, Any]] = []
+
+    def note(_saved: object, dataset: DrivingDataset, **options: Any) -> Report:
+        given.append({**options, "classes": dataset.class_names})
+        return run[0]
+
+    monkeypatch.setattr("trilitenet.commands.score.score_predictions", note)
+    asked: dict[str, Any] = {
+        "protocol": "both", "confidence": 0.5, "limit": 2, "resamples": 7, "worst": 2, "by": ("scene",),
+        "paper_batch": 5, "classes": ("car",),
+    }  # fmt: skip
+    saved = shutil.copytree(run[1] / "predictions", tmp_path / "predictions")
+    hashes = []
+    for change in (None, "drivable/{3}.png", "drivable/{1}.png", "lane/{0}.png", "detections.json"):
+        if change is not None:
+            path = saved / change.format(*DrivingDataset(data, "val").names)
+            path.write_bytes(path.read_bytes() + b" ")
+        score(saved, data=data, **asked)
+        hashes.append(given[-1]["about"]["model_sha256"])
+    assert given[0].items() >= asked.items()
+    assert hashes[0] == hashes[1]  # of an image that is not scored
+    assert len(set(hashes)) == 4
+
+
+@pytest.mark.parametrize(("drivable", "lane", "fine"), [(0.5, 0.5, True), (0.4, 0.5, False), (0.5, 0.6, False)])
+def test_masks_that_an_artefact_decides_by_the_likelier_class_are_those_of_the_published_protocol(
+    drivable: float, lane: float, *, fine: bool
+) -> None:
+    card = ModelCard("tiny", thresholds=Thresholds(drivable=drivable, lane=lane))
+    info = ArtefactInfo("onnx", "fp32", (96, 160), "uint8_nhwc", "rgb", "decision")
+    predictor: Any = SimpleNamespace(card=card, backend=SimpleNamespace(info=info))
+    _check_artefact("m.onnx", predictor, "fair")
+    with contextlib.nullcontext() if fine else pytest.raises(ConfigError, match="--masks probability"):
+        _check_artefact("m.onnx", predictor, "both")

@@ -136,8 +136,9 @@ def test_thresholds_that_a_file_fixes_inside_are_refused() -> None:
             Predictor(backend, wrong)
     backend.info = ArtefactInfo("onnx")  # type: ignore[attr-defined]
     assert Predictor(backend, dataclasses.replace(own, confidence=0.01)).least_confidence == 0
-    with pytest.raises(ConfigError, match="--masks probability"):
-        Predictor(backend, dataclasses.replace(own, lane=0.9))
+    for decided in (dataclasses.replace(own, lane=0.9), dataclasses.replace(own, drivable=0.9)):
+        with pytest.raises(ConfigError, match="--masks probability"):
+            Predictor(backend, decided)
 
 
 def test_images_are_resized_as_in_training_unless_told_otherwise() -> None:
