@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+import json
 import multiprocessing
 import os
 import random
@@ -13,7 +14,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,20 +24,20 @@ import torch
 import yaml
 
 import trilitenet
-from trilitenet.commands.train import _display, train, validation_figures
+from trilitenet.commands.train import _display, build_loss, train, training_data, validation_figures
 from trilitenet.commands.train_table import train_table
 from trilitenet.config import DEFAULT_ANCHORS, TASKS
 from trilitenet.data.description import read_description, write_description
 from trilitenet.data.loader import epoch_order
 from trilitenet.data.prepared import prepare
-from trilitenet.data.reading import DrivingDataset
+from trilitenet.data.reading import DrivingDataset, MixedDataset
 from trilitenet.data.synthetic_files import write_dataset
 from trilitenet.engine import train as engine
 from trilitenet.engine.checkpoint import read_checkpoint, write_checkpoint
 from trilitenet.engine.ema import MovingAverage
 from trilitenet.engine.loggers import CsvLogger, read_csv
 from trilitenet.engine.predictions import PredictionWriter
-from trilitenet.engine.recipe import read_recipe
+from trilitenet.engine.recipe import TrainConfig, read_recipe
 from trilitenet.engine.results import write_results
 from trilitenet.engine.train import Trainer, TrainResult
 from trilitenet.errors import ConfigError, DataError, MissingExtraError, OutputError, TrainingError, WeightsError
@@ -837,7 +838,8 @@ def test_a_log_that_cannot_be_written_is_told_once(
 
     monkeypatch.setattr(CsvLogger, "log", log)
     with pytest.raises(
-        OutputError, match=r"cannot be written \(No space .* mended, --resume goes on after step 3 of 6"
+        OutputError,
+        match=r"cannot be written \(No space .* mended, --resume goes on after step 3 of 6 \(epoch 2 of 10\)$",
     ):
         train(**logged(scenes, tmp_path, max_steps=6))
 
@@ -1006,3 +1008,163 @@ def test_the_first_process_alone_tells_the_result(tmp_path: Path) -> None:
 
 def test_engine_names_the_figures_validation_returns() -> None:
     assert set(engine.FIGURES) == {"detection", "drivable", "lane"}
+
+
+class _Made(Exception):  # noqa: N818 - no error, but far enough
+    """What a run is made of."""
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, Any]]:
+    """Return what makes a run but does not train it, and returns what it would be of."""
+    found: dict[str, Any] = {}
+
+    def loader(dataset: Any, transform: Any, **options: Any) -> list[None]:
+        found.update(options, dataset=dataset, transform=transform)
+        return [None]
+
+    def trainer(config: Any, network: Any, loss: Any, loader: Any, fabric: Any, card: Any, **more: Any) -> None:
+        found.update(more, config=config, network=network, loss=loss, fabric=fabric, card=card)
+        raise _Made
+
+    monkeypatch.setattr("trilitenet.commands.train.build_loader", loader)
+    monkeypatch.setattr("trilitenet.commands.train.Trainer", trainer)
+
+    def make(recipe: Path | None = None, **fields: Any) -> dict[str, Any]:
+        found.clear()
+        with pytest.raises(_Made):
+            train(recipe, **fields)
+        return dict(found)
+
+    return make
+
+
+def test_what_a_recipe_says_reaches_the_parts_of_a_run(
+    scenes: Path, tmp_path: Path, made: Callable[..., dict[str, Any]]
+) -> None:
+    (tmp_path / "own.yaml").write_text("{}")
+    own = (np.array(DEFAULT_ANCHORS) * 1.5).round(3).tolist()
+    more: dict[str, Any] = {
+        "accumulate": 2, "seed": 7, "samples_per_epoch": 9, "workers": 3, "anchors": own, "pcaa": False,
+        "freeze": ("lane",), "classes": ("car", "bus"), "sampling": {"timeofday": {"night": 2.0, "daytime": 0.5}},
+        "val_split": "val",
+    }  # fmt: skip
+    parts = made(tmp_path / "own.yaml", **settings(scenes, tmp_path / "run", **more))
+    given = {
+        name: parts[name] for name in ("batch_size", "seed", "samples_per_epoch", "workers", "pin_memory", "share")
+    }
+    assert given == {
+        "batch_size": 2, "seed": 7, "samples_per_epoch": 9, "workers": 3, "pin_memory": False, "share": (0, 1)
+    }  # fmt: skip
+    assert set(parts["weights"]) <= {0.5, 1.0, 2.0}
+    network, card = parts["network"], parts["card"]
+    assert (card.blocks, card.class_names, card.input_size) == (("litepan", "spp"), ("car", "bus"), (64, 128))
+    torch.testing.assert_close(network.anchors, torch.tensor(own))
+    assert card.provenance == {"recipe": "own.yaml", "seed": "7"}
+    assert card.training_data == (f"{scenes.name} (train): 10 images",)
+    assert {parameter.requires_grad for parameter in network.lane.parameters()} == {False}
+    assert all(parameter.requires_grad for parameter in network.encoder.parameters())
+    assert parts["identity"]["images"] == 10
+    assert parts["teacher"] is None
+    other, plain = (
+        made(**settings(scenes, tmp_path / "run", **options))
+        for options in ({"seed": 8, "litepan": False}, {"spp": False})
+    )
+    assert (other["card"].blocks, plain["card"].blocks) == (("pcaa", "spp"), ("pcaa", "litepan"))
+    assert (plain["weights"], plain["validate"], plain["card"].provenance["recipe"]) == (None, None, "defaults")
+
+
+def test_the_seed_decides_the_first_weights(scenes: Path, tmp_path: Path, made: Callable[..., dict[str, Any]]) -> None:
+    first, again, other = (
+        made(**settings(scenes, tmp_path, seed=seed))["network"].encoder.level1.conv.weight for seed in (0, 0, 1)
+    )
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_anchors_are_fitted_to_the_boxes_unless_others_are_known(
+    scenes: Path, tmp_path: Path, made: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    default = build_network("tiny").anchors
+    options = settings(scenes, tmp_path, auto_anchor=True, anchor_recall=1.1)
+    fitted = made(**options)["network"].anchors
+    assert not torch.allclose(fitted, default)
+    capsys.readouterr()
+    own = (np.array(DEFAULT_ANCHORS) * 1.5).tolist()
+    for more in ({"anchors": own}, {"tasks": ("lane",)}, {"auto_anchor": False}):
+        made(**options | more)
+        assert "anchors" not in capsys.readouterr().err
+    # Those of weights that are taken over give way to ones that fit better.
+    initial = load_network("tiny").anchors
+    assert not torch.allclose(made(**options, init="tiny")["network"].anchors, initial, rtol=0.1)
+    masks = build_network("tiny", 1, ("lane",))
+    save_network(masks, tmp_path / "lane.safetensors", masks.card)
+    fits = options | {"anchor_recall": 0.0, "init": str(tmp_path / "lane.safetensors")}
+    torch.testing.assert_close(made(**fits)["network"].anchors, default)
+    assert made(**fits)["card"].provenance["initial weights"] == "lane.safetensors"
+
+
+def test_further_data_are_drawn_by_their_weight(scenes: Path, tmp_path: Path) -> None:
+    write_dataset(tmp_path / "own", "val", 2, 5, size=(96, 160))
+    config = TrainConfig(data=str(scenes), extra_data={str(tmp_path / "own"): 3.0}, train_split="val")
+    mixed = training_data(config)
+    assert isinstance(mixed, MixedDataset)
+    assert mixed.weights.tolist() == [1, 1, 1, 3, 3]
+    named = training_data(dataclasses.replace(config, classes=("bus", "person")))
+    assert named.class_names == ("bus", "person")
+
+
+def test_the_cards_of_mixed_data_name_all(
+    scenes: Path, tmp_path: Path, made: Callable[..., dict[str, Any]], caplog: pytest.LogCaptureFixture
+) -> None:
+    more = shutil.copytree(scenes, tmp_path / "more")
+    shutil.rmtree(more / "ll_seg_annotations" / "train")
+    parts = made(**settings(more, tmp_path / "run", extra_data={str(scenes): 1.0}))
+    assert parts["card"].training_data == (f"more, {scenes.name} (train): 20 images",)
+    assert "no image" not in caplog.text  # one of the two is labelled for lanes
+
+
+def test_the_loss_is_what_the_recipe_says() -> None:
+    config = TrainConfig(
+        task_weights=(1.0, 2.0, 3.0),
+        balancing="uncertainty",
+        box_gains=(0.1, 0.2, 0.3),
+        single_class_loss=False,
+        label_smoothing=0.4,
+        drivable_tversky=(0.6, 0.4),
+        lane_tversky=(0.8, 0.2),
+        focal=(0.5, 1.5),
+    )
+    network = build_network("tiny")
+    loss = build_loss(config, network)
+    assert loss.detection is not None
+    boxes, drivable, lane = loss.detection, loss.drivable, loss.lane
+    assert torch.equal(boxes.anchors, network.anchors)
+    assert (boxes.gains, boxes.single_class_loss, boxes.label_smoothing) == ((0.1, 0.2, 0.3), False, 0.4)
+    assert (drivable.alpha, drivable.beta, lane.alpha, lane.beta) == (0.6, 0.4, 0.8, 0.2)
+    assert {(part.focal_alpha, part.focal_gamma) for part in (drivable, lane)} == {(0.5, 1.5)}
+    assert loss.weights == (1.0, 2.0, 3.0)
+    assert loss.log_variance is not None
+    assert build_loss(config, build_network("tiny", 1, ("lane",))).detection is None
+
+
+def test_what_a_run_needs_is_asked_for_before_it_begins(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: dict[str, Any] = {}
+
+    def fabric(*machine: Any, **more: Any) -> None:
+        given.update(more, machine=machine)
+        raise _Made
+
+    monkeypatch.setattr("trilitenet.commands.train.running_fabric", fabric)
+    with pytest.raises(_Made):
+        train(overwrite=True, **logged(scenes, tmp_path, devices=3, num_nodes=2, seed=5))
+    assert (given["machine"], given["devices"], given["num_nodes"]) == (("cpu", "32-true"), 3, 2)
+    told = json.loads(given["command"][-1])
+    assert (told["seed"], told["resume"], told["overwrite"]) == (5, False, True)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(MissingExtraError, match="matplotlib"):
+        train(**logged(scenes, tmp_path))
+    with pytest.raises(_Made):  # whose page of results has no curves
+        train(**settings(scenes, tmp_path))

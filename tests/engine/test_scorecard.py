@@ -96,6 +96,15 @@ def test_plots_of_detection_have_few_points_and_all_boxes() -> None:
     assert plots.confidence[0] > 0.95 > 0.05 > plots.confidence[-1]
 
 
+def test_pictures_have_the_boxes_above_the_stated_confidence() -> None:
+    pictures = []
+    for confidence in (0.25, 0.6):
+        scores = Scorecard(("vehicle",), ("detection",), confidence=confidence)
+        add(scores, "a", 1, 2)  # of confidence 0.9 and 0.5
+        pictures.append(scores.report(nothing, resamples=0).worst[0].picture)
+    assert pictures[0] != pictures[1]
+
+
 def test_no_image_is_no_report() -> None:
     with pytest.raises(DataError, match="no images to score"):
         card().report(nothing)
