@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import re
 from pathlib import Path
 
@@ -33,6 +34,10 @@ def test_the_json_form_holds_everything_but_pictures(report: Report, tmp_path: P
     report.save_json(path)
     mapping = json.loads(path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert mapping["schema"] == 1
+    assert [(row["value"], row["few"]) for row in mapping["conditions"]] == [
+        ("daytime", False),
+        ("night", True),
+    ]  # 30, 10
     assert set(mapping["provenance"]) >= {"model", "model_sha256", "data_sha256", "thresholds", "versions", "hardware"}
     again = read_report(path)
     assert str(again.fair) == str(report.fair)
@@ -74,6 +79,10 @@ def test_the_terminal_form_names_every_figure(report: Report, monkeypatch: pytes
     assert re.search(r"night +10 +\(", text)  # few images stand in brackets
     assert "\x1b" not in text  # no colours into a pipe
     assert max(map(len, text.splitlines())) <= 100
+    assert text.count("timeofday") == 2  # once a protocol
+    monkeypatch.setenv("COLUMNS", "250")
+    fair, paper = report.summary().split("paper protocol")
+    assert (fair.count("mean over batches"), paper.count("mean over batches")) == (0, 8)
 
 
 def test_what_is_no_report_is_refused(tmp_path: Path, report: Report) -> None:
@@ -88,8 +97,11 @@ def test_what_is_no_report_is_refused(tmp_path: Path, report: Report) -> None:
     path.write_text(json.dumps(report.to_dict() | {"figures": {"fair/lane/iou": figure}}))
     with pytest.raises(DataError, match="not a report"):
         read_report(path)
+    path.write_text(json.dumps(report.to_dict() | {"schema": "one"}))
+    with pytest.raises(DataError, match="not a report"):
+        read_report(path)
     path.write_text(json.dumps(report.to_dict() | {"schema": 99}))
-    with pytest.raises(DataError, match="newer"):
+    with pytest.raises(DataError, match=r"report\.json: report schema 99 is newer than 1; upgrade trilitenet$"):
         read_report(path)
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written"):
@@ -205,7 +217,7 @@ def test_published_rows_are_those_of_the_paper() -> None:
     assert len(rows) == len(PUBLISHED_ROWS)
 
 
-def test_corruptions_are_measured_and_averaged() -> None:
+def test_corruptions_are_measured_and_averaged(tmp_path: Path) -> None:
     images = Images(6)
     predictor = fake_predictor(images)
     clean = evaluate(predictor, images, resamples=0)
@@ -222,7 +234,14 @@ def test_corruptions_are_measured_and_averaged() -> None:
     mean = (shown["contrast"][key] + shown["pixelate"][key]) / 2
     assert shown["mean corruption drop"][key] == pytest.approx(1.0 - mean)
     varied = dataclasses.replace(clean, variations=rows)
-    assert CORRUPTED in varied.summary()
+    text = varied.summary().split(CORRUPTED)[1]
+    assert text.count("mIoU") == 1  # no column of a protocol that was not asked for
+    varied.save_html(tmp_path / "report.html")
+    for shown_form in (text, (tmp_path / "report.html").read_text()):
+        assert "pixelate" in shown_form
+        assert "pixelate 1" not in shown_form
+    varied.save_json(tmp_path / "report.json")
+    assert str(read_report(tmp_path / "report.json").variations) == str(rows)
     assert all(row.kind == CORRUPTED for row in rows)
 
 
@@ -265,3 +284,17 @@ def test_every_image_has_noise_of_its_own(monkeypatch: pytest.MonkeyPatch) -> No
     assert len(seen) == 4
     assert np.array_equal(seen[0], seen[1])
     assert not np.array_equal(seen[2], seen[3])
+
+
+def test_undefined_figures_stay_undefined_in_a_file(tmp_path: Path) -> None:
+    images = Images(3)
+    images._samples = [dataclasses.replace(sample, drivable=None) for sample in images._samples]
+    report = evaluate(fake_predictor(images), images, resamples=0)
+    rows = figures_by_size({96: fake_predictor(images)}, images)
+    dataclasses.replace(report, variations=rows).save_json(tmp_path / "report.json")
+    again = read_report(tmp_path / "report.json")
+    key = "fair/drivable/miou"
+    assert math.isnan(report.figures[key].value)
+    assert math.isnan(again.figures[key].value)
+    for row in (*again.conditions, *again.variations):
+        assert math.isnan(row.figures[key])

@@ -378,7 +378,7 @@ def read_report(path: Path) -> Report:
     try:
         mapping = parse_json(path.read_bytes())
         schema = mapping["schema"]
-        if not isinstance(schema, int) or schema > REPORT_SCHEMA:
+        if schema > REPORT_SCHEMA:
             raise DataError(f"{path}: report schema {schema!r} is newer than {REPORT_SCHEMA}; upgrade trilitenet")
         state = mapping["state"]
         provenance = Provenance(**{**mapping["provenance"], "canvas": tuple(mapping["provenance"]["canvas"])})
