@@ -296,5 +296,6 @@ def test_undefined_figures_stay_undefined_in_a_file(tmp_path: Path) -> None:
     key = "fair/drivable/miou"
     assert math.isnan(report.figures[key].value)
     assert math.isnan(again.figures[key].value)
-    for row in (*again.conditions, *again.variations):
-        assert math.isnan(row.figures[key])
+    tables = [row.figures for row in again.conditions] + [row.figures for row in again.variations]
+    assert len(tables) == 3
+    assert all(math.isnan(figures[key]) for figures in tables)

@@ -181,20 +181,20 @@ def test_the_best_of_each_task_and_of_all_is_kept(tmp_path: Path) -> None:
             {"drivable/miou": 0.5, "lane/iou": 0.5, "lane/f1_2px": 0.9},
             {"drivable/miou": 0.7, "lane/iou": 0.2, "lane/f1_2px": 0.9},  # the mean is worse
             {"drivable/miou": math.nan, "lane/iou": 0.6, "lane/f1_2px": 0.9},  # ... and of the lane alone better
-            {"drivable/miou": 0.1, "lane/iou": 0.1, "lane/f1_2px": 0.9},
+            {"drivable/miou": 0.1, "lane/iou": 0.7, "lane/f1_2px": 0.9},  # the mean is worse
             {"drivable/miou": 0.1, "lane/iou": 0.1, "lane/f1_2px": 0.9},
         ]
     )
     run = trainer(tmp_path, validate=lambda *_: next(figures), tasks=("drivable", "lane"), epochs=9, patience=2)
     result, told = fit(run)
-    assert result.best == {"drivable": 0.7, "lane": 0.6, "overall": 0.6}
-    assert (result.finished, result.steps) == (True, 10)  # the fourth and the fifth were no better
-    for name, step in (("drivable", "4"), ("lane", "6"), ("overall", "6")):
+    assert result.best == {"drivable": 0.7, "lane": 0.7, "overall": 0.6}
+    assert (result.finished, result.steps) == (True, 10)  # the means of the last two were no better
+    for name, step in (("drivable", "4"), ("lane", "8"), ("overall", "6")):
         card = read_card(tmp_path / f"best-{name}.safetensors")
         assert card.provenance["steps"] == step
         assert card.metrics[f"best {name}"] == result.best[name]
         assert card.metrics["val lane/f1_2px"] == 0.9
-    assert told.of("val/lane/iou") == [0.5, 0.2, 0.6, 0.1, 0.1]
+    assert told.of("val/lane/iou") == [0.5, 0.2, 0.6, 0.7, 0.1]
     assert read_card(result.weights).metrics["val lane/iou"] == 0.1
 
 
