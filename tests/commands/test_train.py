@@ -1064,7 +1064,7 @@ def test_what_a_recipe_says_reaches_the_parts_of_a_run(
     assert card.training_data == (f"{scenes.name} (train): 10 images",)
     assert {parameter.requires_grad for parameter in network.lane.parameters()} == {False}
     assert all(parameter.requires_grad for parameter in network.encoder.parameters())
-    assert parts["identity"]["images"] == 10
+    assert [part["images"] for part in parts["identity"]["parts"]] == [10]
     assert parts["teacher"] is None
     other, plain = (
         made(**settings(scenes, tmp_path / "run", **options))

@@ -283,6 +283,15 @@ def test_a_bad_step_is_no_part_of_the_logged_losses(
     assert "step 1 skipped: its loss or gradient is not finite (images: 4, 5, 6, 7)" in caplog.text
 
 
+def test_logged_losses_are_the_mean_of_the_steps_since_the_last_ones(tmp_path: Path) -> None:
+    each, both = (
+        fit(trainer(tmp_path / str(steps), tasks=("drivable",), max_steps=2, log_every=steps))[1] for steps in (1, 2)
+    )
+    assert len(each.of("train/total")) == 2
+    assert both.of("train/total") == [pytest.approx(sum(each.of("train/total")) / 2)]
+    assert each.of("train/total")[0] != pytest.approx(each.of("train/total")[1], rel=1e-3)
+
+
 def test_an_error_of_the_network_is_not_taken_for_one_of_a_worker(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
