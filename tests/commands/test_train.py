@@ -1112,6 +1112,10 @@ def test_further_data_are_drawn_by_their_weight(scenes: Path, tmp_path: Path) ->
     assert mixed.weights.tolist() == [1, 1, 1, 3, 3]
     named = training_data(dataclasses.replace(config, classes=("bus", "person")))
     assert named.class_names == ("bus", "person")
+    data = shutil.copytree(scenes, tmp_path / "data")
+    classes: dict[str, tuple[str, ...]] = {"car": ("car",), "lorry": ("truck",)}
+    write_description(data, dataclasses.replace(read_description(data), classes=classes))
+    assert training_data(dataclasses.replace(config, data=str(data))).class_names == ("car", "lorry")  # of the first
 
 
 def test_the_cards_of_mixed_data_name_all(
