@@ -44,6 +44,7 @@ def test_the_resolved_configuration_reads_back(tmp_path: Path) -> None:
         ("lr: fast", "lr"),
         ("lr: 0", "lr must be above 0"),
         ("variant: huge", "unknown variant"),
+        ("device: gpu", "device: Input should be 'auto', 'cpu', 'cuda' or 'mps'"),
         ("epochs: 0", "epochs must be at least 1"),
         ("batch_size: 10\naccumulate: 4", "not a multiple"),
         ("ema_decay: 1", "ema_decay"),

@@ -87,10 +87,22 @@ def test_too_large_a_batch_is_one_line(backend: TorchBackend, monkeypatch: pytes
         backend.run(np.zeros((2, 64, 96, 3), np.uint8))
 
 
-@pytest.mark.parametrize("device", ["cuda:99", "nonsense", "meta:x"])
+@pytest.mark.parametrize("device", ["cuda:99", "nonsense", "meta:x", "hpu"])
 def test_a_device_that_is_not_there_is_named(device: str) -> None:
     with pytest.raises(BackendError, match=device):
         pick_device(device)
+
+
+def test_of_an_unknown_device_those_that_there_are_are_told() -> None:
+    with pytest.raises(BackendError, match=r"^unknown device 'gpu'; use auto, cpu, cuda, cuda:1 \(.*\) or mps$"):
+        pick_device("gpu")
+
+
+@pytest.mark.skipif(torch.backends.mps.is_available(), reason="a machine that has MPS")
+def test_of_a_long_reason_the_first_sentence_is_told() -> None:
+    with pytest.raises(BackendError, match=r"^device 'mps' cannot be used \(.*\); try 'cpu'$") as caught:
+        pick_device("mps")
+    assert ". " not in str(caught.value)
 
 
 def test_auto_finds_a_device() -> None:

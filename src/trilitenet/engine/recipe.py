@@ -143,7 +143,7 @@ class TrainConfig:
     pictures: int = 6
     seed: int = 0
     output: str = "runs/train"
-    device: str = "auto"
+    device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     devices: int = 1
     num_nodes: int = 1
     precision: Literal["auto", "32-true", "bf16-mixed", "16-mixed"] = "auto"

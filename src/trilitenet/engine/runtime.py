@@ -148,7 +148,7 @@ def _build_fabric(device: str, precision: str, devices: int, num_nodes: int) -> 
     picked = pick_precision(precision, accelerator)
     try:
         fabric = lightning.Fabric(accelerator=accelerator, precision=picked, **settings)
-    except (ValueError, TypeError, ImportError) as error:  # the last of a device whose package is not here
+    except (ValueError, TypeError) as error:
         raise ConfigError(f"device {device!r} with precision {precision!r}: {error}") from error
     if _emulates(picked, accelerator) and fabric.global_rank == 0:
         _LOGGER.warning("this processor has no instructions for bf16: --precision 32-true is faster")

@@ -53,9 +53,12 @@ def pick_device(device: str = "auto") -> torch.device:
         return torch.device("mps" if torch.backends.mps.is_available() else "cpu")
     try:
         chosen = torch.device(device)
+    except RuntimeError as error:
+        raise BackendError(f"unknown device {device!r}; use auto, cpu, cuda, cuda:1 (another GPU) or mps") from error
+    try:
         torch.empty(0, device=chosen)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).partition("\n")[0].rstrip(".")
+    except (RuntimeError, AssertionError, ImportError) as error:
+        reason = str(error).partition("\n")[0].partition(". ")[0].rstrip(".")
         raise BackendError(f"device {device!r} cannot be used ({reason}); try 'cpu'") from error
     return chosen
 
