@@ -169,7 +169,9 @@ def test_lane_widths_by_split_and_for_the_others(words: list[str], widths: dict[
     assert _widths(words) == widths
 
 
-def test_check_says_what_is_wrong(published: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_says_what_is_wrong(
+    published: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("imagehash")
     html, document = tmp_path / "report.html", tmp_path / "report.json"
     words = ["data", "check", str(published), "--html", str(html), "--json", str(document), "--workers", "1"]
@@ -189,6 +191,11 @@ def test_check_says_what_is_wrong(published: Path, tmp_path: Path, capsys: pytes
     assert "images/train/left[a]:car:.jpg" in shown  # brackets and colons are no markup
     assert json.loads(document.read_text())["findings"][0]["kind"] == "image-unreadable"
     assert "image-unreadable" in html.read_text()
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(words[:3]) == 1
+    faults = capsys.readouterr().out.partition("best possible recall")[2].splitlines()[1:]
+    assert max(map(len, faults)) <= 80
+    assert "\N{HORIZONTAL ELLIPSIS}" not in "".join(faults)
     with pytest.raises(DataError, match="looks like nothing known"):
         check(tmp_path)
 

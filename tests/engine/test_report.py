@@ -85,6 +85,19 @@ def test_the_terminal_form_names_every_figure(report: Report, monkeypatch: pytes
     assert (fair.count("mean over batches"), paper.count("mean over batches")) == (0, 8)
 
 
+def test_on_a_narrow_terminal_nothing_is_cut_off(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    named = dataclasses.replace(report.conditions[0], attribute="source", value="traffic_light_samples")
+    elsewhere = dataclasses.replace(report.provenance, data=f"/home/{'somebody' * 9}/bdd100k")
+    long = dataclasses.replace(report, conditions=(named,), provenance=elsewhere)
+    conditions = long.summary().partition("by condition, fair")[2]
+    published = compare_reports({"a": long}, resamples=0, published=True).summary().partition("beside published")[2]
+    for text, last in ((conditions, "mples"), (published, "72.3")):
+        assert last in text
+        assert "\N{HORIZONTAL ELLIPSIS}" not in text
+        assert max(map(len, text.splitlines())) <= 80
+
+
 def test_what_is_no_report_is_refused(tmp_path: Path, report: Report) -> None:
     path = tmp_path / "report.json"
     with pytest.raises(DataError, match="cannot be read"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import io
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -13,7 +12,6 @@ from typing import Annotated, Any, Literal
 
 import cv2
 from cyclopts import Parameter
-from rich.console import Console
 from rich.table import Table
 
 from trilitenet.commands.paths import NameOrPath, StrPath, one_for_several, optional_path
@@ -29,6 +27,7 @@ from trilitenet.data.prepared import prepare as run_preparation
 from trilitenet.data.reading import IMAGE_FOLDER, DrivingDataset
 from trilitenet.data.records import RecordSource
 from trilitenet.data.sample import Sample
+from trilitenet.engine.report import render
 from trilitenet.errors import ConfigError, DataError, OutputError, write_file
 from trilitenet.formats.readers.bdd100k import read_bdd100k
 from trilitenet.formats.readers.coco import read_coco
@@ -78,7 +77,7 @@ class Converted:
         table = Table("split", "images", "detection", "drivable", "lane", "boxes", "markings")
         for split in self.report.images:
             table.add_row(*_counts(self.report, split), _listed(self.report.lanes[split]))
-        lines = [*self.found, _rendered(table)]
+        lines = [*self.found, render([table])]
         if any("masks" in lanes for lanes in self.report.lanes.values()):
             lines.append("lane masks keep the width they are drawn in; --lane-width is for lines")
         for split, reasons in self.report.dropped.items():
@@ -189,7 +188,7 @@ class Checked:
         counts = Table("split", "images", "detection", "drivable", "lane", "boxes")
         for split in report.images:
             counts.add_row(*_counts(report, split))
-        lines = [f"{report.root}: taken for {report.layout}", _rendered(counts)]
+        lines = [f"{report.root}: taken for {report.layout}", render([counts])]
         few = {key: values for key, values in report.conditions.items() if len(values) <= 12}
         for key, values in few.items():
             lines.append(f"{key}: " + ", ".join(f"{value} {sum(n.values())}" for value, n in values.items()))
@@ -201,7 +200,7 @@ class Checked:
                 faults.add_row(
                     finding.kind, finding.split, str(finding.count), KINDS[finding.kind], finding.examples[0]
                 )
-            lines.append(_rendered(faults))
+            lines.append(render([faults]))
         else:
             lines.append("nothing wrong")
         return "\n".join([*lines, *(f"written: {path}" for path in self.files)])
@@ -506,9 +505,3 @@ def _counts(report: ConversionReport | CheckReport, split: str) -> tuple[str, ..
 
 def _listed(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items())
-
-
-def _rendered(table: Table) -> str:
-    text = io.StringIO()
-    Console(file=text, width=140, markup=False, emoji=False).print(table)  # names may have brackets
-    return text.getvalue().rstrip()

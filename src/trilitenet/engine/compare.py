@@ -251,8 +251,8 @@ def _published_table(comparison: Comparison) -> list[Table | Text]:
     shown = titled_table("beside published rows (per cent)")
     shown.add_column("model")
     for key in keys:
-        shown.add_column(_label(key).removeprefix("paper "), justify="right")
-    shown.add_column("measured", no_wrap=True)
+        shown.add_column(_label(key).removeprefix("paper ").replace(" ", "\n", 1), justify="right")
+    shown.add_column("measured")
     for name in comparison.names:
         cells = [percent(comparison.figures[name].get(key)) for key in keys]
         shown.add_row(name, *cells, f"here, {comparison.data[name]}", style="bold")

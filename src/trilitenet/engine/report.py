@@ -273,12 +273,17 @@ class Report:
 
 
 def render(parts: list[Any]) -> str:
-    """Render rich objects as text, coloured if standard output is a terminal; brackets in names are no markup."""
+    """Render rich objects as text, coloured if standard output is a terminal; brackets in names are no markup.
+
+    What is too long for a column of a table goes on in the next line: nothing is cut off.
+    """
     buffer = io.StringIO()
     terminal = sys.stdout.isatty()
     width = max(shutil.get_terminal_size((110, 40)).columns, 80)
     console = Console(file=buffer, force_terminal=terminal, width=width, highlight=False, markup=False, emoji=False)
     for part in parts:
+        for column in part.columns if isinstance(part, Table) else ():
+            column.overflow = "fold"
         console.print(part)
     return buffer.getvalue().rstrip()
 
@@ -314,7 +319,7 @@ def _condition_table(protocol: str, conditions: tuple[Condition, ...]) -> Table:
     table.add_column("value")
     table.add_column("images", justify="right")
     for key in keys:
-        table.add_column(f"{key.split('/')[1]} {meaning(key).title}", justify="right")
+        table.add_column(f"{key.split('/')[1]}\n{meaning(key).title}", justify="right")
     last = ""
     for row in conditions:
         cells = [percent(row.figures.get(key)) for key in keys]
@@ -339,7 +344,7 @@ def _variation_tables(variations: tuple[Variation, ...]) -> list[Table]:
         table = titled_table(f"{kind} (per cent)")
         table.add_column("")
         for key in keys:
-            table.add_column(f"{key.split('/')[1]} {meaning(key).title}", justify="right")
+            table.add_column(f"{key.split('/')[1]}\n{meaning(key).title}", justify="right")
         for member in members:
             table.add_row(member.name, *(percent(member.figures.get(key)) for key in keys))
         tables.append(table)
