@@ -228,7 +228,11 @@ def test_show_sheets_and_pages(published: Path, tmp_path: Path) -> None:
     assert rest.count == 2
     with pytest.raises(DataError, match="no image with timeofday=noon in any split"):
         show(published, sheet, where=["timeofday=noon"])
-    with pytest.raises(DataError, match="no image after the first 24 in val"):
+    with pytest.raises(
+        DataError, match=r"no image with time=night in val: none has .* 'time'; did you mean 'timeofday'\?"
+    ):
+        show(published, tmp_path / "x.jpg", split="val", where=["time=night"])
+    with pytest.raises(DataError, match=r"no image after the first 24 in val$"):
         show(published, sheet, split="val", start=24)
     with pytest.raises(ConfigError, match="ATTRIBUTE=VALUE"):
         show(published, sheet, where=["night"])

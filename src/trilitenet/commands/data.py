@@ -28,7 +28,7 @@ from trilitenet.data.reading import IMAGE_FOLDER, DrivingDataset
 from trilitenet.data.records import RecordSource
 from trilitenet.data.sample import Sample
 from trilitenet.engine.report import render
-from trilitenet.errors import ConfigError, DataError, OutputError, write_file
+from trilitenet.errors import ConfigError, DataError, OutputError, did_you_mean, write_file
 from trilitenet.formats.readers.bdd100k import read_bdd100k
 from trilitenet.formats.readers.coco import read_coco
 from trilitenet.formats.readers.cvat import read_cvat
@@ -254,7 +254,7 @@ class Shown:
 
     def summary(self) -> str:
         """Return one line for people."""
-        return f"{self.count} images on {self.output}"
+        return f"{self.count} image{'' if self.count == 1 else 's'} on {self.output}"
 
 
 @one_for_several
@@ -304,16 +304,19 @@ def show(
         if value < least:
             raise ConfigError(f"{option} must be at least {least}, got {value}")
     wanted = dict(_pair(item) for item in where)
+    datasets = {name: DrivingDataset(root, name) for name in ([split] if split else _splits(root))}
     groups = {}
-    for name in [split] if split else _splits(root):
-        dataset = DrivingDataset(root, name)
+    for name, dataset in datasets.items():
         indices = pick(dataset, wanted, count, seed=seed, start=start)
         if indices:
             groups[name] = (dataset, indices)
     if not groups:
         which = f" with {', '.join(where)}" if where else ""
         after = f" after the first {start}" if start else ""
-        raise DataError(f"{root}: no image{which}{after} in {split or 'any split'}")
+        known = {key for dataset in datasets.values() for i in range(len(dataset)) for key in dataset.attributes(i)}
+        unknown = next((key for key in wanted if key not in known), None)
+        hint = "" if unknown is None else f": none has the attribute {unknown!r}{did_you_mean(unknown, known)}"
+        raise DataError(f"{root}: no image{which}{after} in {split or 'any split'}{hint}")
     shown = sum(len(indices) for _, indices in groups.values())
     if output.suffix.lower() == ".html":
         pictures = {
