@@ -418,6 +418,7 @@ def test_a_reader_that_has_gone_does_not_change_the_exit_code(tmp_path: Path) ->
         ("data check .", ">&- 2>&-", 1, ""),
         ("data check .", ">/dev/full", 1, "error: standard output: cannot be written (No space left on device)\n"),
         ("--help", ">/dev/full", 1, "error: standard output: cannot be written (No space left on device)\n"),
+        ("weights info tiny", ">/dev/full", 1, "error: standard output: cannot be written (No space left on device)\n"),
         ("predict -", "<&-", 1, "error: stdin: is closed\n"),
         ("nonsense", "2>&-", 2, ""),
     ],

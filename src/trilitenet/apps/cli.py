@@ -218,7 +218,8 @@ def main(words: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader, such as `head`, has gone
         _discard_output()
     except OSError as error:
-        if not words or {"--help", "-h", "--version"} & set(words):
+        printed = not words or {"--help", "-h", "--version"} & set(words)
+        if printed or (words[:2] == ["weights", "info"] and error.filename is None):  # what writes by itself
             return _fail(_output_failed(error), code=1)
         if error.filename is None:
             raise
