@@ -155,7 +155,7 @@ def benchmark(
     """Measure latency, its tail, frames a second, first-result time and energy of models and runtimes, in turn.
 
     Args:
-        models: Names of shipped weights, weight files or exported artefacts; the first is the baseline.
+        models: Names of shipped weights (tiny if left out), weight files or artefacts; the first is the baseline.
         backend: Runtimes to try each model on; those that do not run a file are an error.
         batch: Images a call.
         stage: network (letterboxed pixels to raw outputs) or frame (image to boxes and masks of its own size).
