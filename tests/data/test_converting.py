@@ -262,10 +262,6 @@ def test_another_source_is_refused(tmp_path: Path) -> None:
     source.origin = {"kind": "another"}  # type: ignore[misc]
     with pytest.raises(OutputError, match="another source"):
         convert(source, tmp_path / "out")
-    options = tmp_path / "out/.conversion/options.json"
-    options.write_text(json.dumps({k: v for k, v in json.loads(options.read_text()).items() if k != "source"}))
-    with pytest.raises(OutputError, match="does not say of what source"):
-        convert(source, tmp_path / "out")
 
 
 def test_splits_one_by_one_are_reported_together(tmp_path: Path) -> None:

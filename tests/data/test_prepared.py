@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import logging
 import os
 import sys
@@ -300,17 +299,6 @@ def test_damaged_shards_are_named_and_made_anew(root: Path, tmp_path: Path) -> N
             DataError, match=rf"prepared\.json: {message}.*; remove .*out and prepare the data set again"
         ):
             read()
-
-
-def test_a_data_set_prepared_without_counts_is_read(root: Path, tmp_path: Path) -> None:
-    prepare(root, tmp_path / "out", canvas=CANVAS, splits=["val"])
-    path = tmp_path / "out/prepared.json"
-    state = json.loads(path.read_text())
-    assert state.pop("counts") == {"val": 3}
-    path.write_text(json.dumps(state))
-    assert len(PreparedDataset(tmp_path / "out", "val")) == 3
-    prepare(root, tmp_path / "out", canvas=CANVAS, splits=["train"])
-    assert json.loads(path.read_text())["counts"] == {"train": 11}
 
 
 def test_a_split_without_images_is_left_out(root: Path, tmp_path: Path) -> None:

@@ -23,8 +23,9 @@ from trilitenet.errors import OutputError, WeightsError
 
 def whole(**fields: Any) -> dict[str, Any]:
     """Return all that a checkpoint must hold."""
-    names = ("config", "network", "optimiser", "loss", "best", "metrics", "random")
-    return {"step": 0, "ema": None, **{name: {} for name in names}, **fields}
+    names = ("config", "network", "optimiser", "loss", "scaler", "best", "metrics", "random")
+    numbers = dict.fromkeys(("classes", "step", "stale", "ended"), 0)
+    return {**numbers, "data": None, "ema": None, **{name: {} for name in names}, **fields}
 
 
 def test_state_goes_round(tmp_path: Path) -> None:

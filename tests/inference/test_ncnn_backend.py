@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import subprocess
@@ -136,13 +137,13 @@ def test_a_piece_of_a_graph_is_refused(copied: Path) -> None:
         NcnnBackend(copied)
 
 
-def test_the_graph_of_an_earlier_version_has_no_hash(copied: Path) -> None:
+def test_a_graph_without_a_task_is_refused(copied: Path) -> None:
+    graph = copied.read_text(encoding="utf-8").replace(" lane ", " road ")
+    copied.write_text(graph, encoding="utf-8")
     side = copied.with_suffix(".json")
     found = json.loads(side.read_text(encoding="utf-8"))
-    del found[GRAPH_HASH_KEY]
+    found[GRAPH_HASH_KEY] = hashlib.sha256(graph.encode()).hexdigest()
     side.write_text(json.dumps(found), encoding="utf-8")
-    assert NcnnBackend(copied).card.classes == 2
-    copied.write_text(copied.read_text(encoding="utf-8").replace(" lane ", " road "), encoding="utf-8")
     with pytest.raises(WeightsError, match="has no lane"):
         NcnnBackend(copied)
 

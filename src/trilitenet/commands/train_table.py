@@ -182,7 +182,7 @@ def _check_done(folder: Path, config: TrainConfig) -> None:
             asked = f"was trained with {name} {old.get(name)!r}, now {new.get(name)!r} is asked for"
             raise OutputError(f"{folder}: {asked}; {cure}")
     checkpoint = folder / CHECKPOINT_NAME
-    identity = read_checkpoint(checkpoint).get("data") if checkpoint.is_file() else None
+    identity = read_checkpoint(checkpoint)["data"] if checkpoint.is_file() else None
     difference = tell_apart(identity, identify(training_data(config)), strict=True) if identity else None
     if difference:
         raise OutputError(f"{folder}: was trained on {difference}; {cure}")

@@ -550,12 +550,7 @@ def _open_state(root: Path, options: ConversionOptions, origin: Mapping[str, str
     text = json.dumps({**dataclasses.asdict(options), "source": dict(origin)}, sort_keys=True, indent=1)
     path = state / "options.json"
     if path.is_file():
-        there = path.read_text(encoding="utf-8")
-        if '"source": {' not in there:
-            raise OutputError(
-                f"{root}: holds a conversion that does not say of what source; choose another folder or remove it"
-            )
-        if there != text:
+        if path.read_text(encoding="utf-8") != text:
             raise OutputError(
                 f"{root}: holds a conversion with other options or another source; choose another folder or remove it"
             )

@@ -60,7 +60,7 @@ CACHE_FOLDER: Final = ".prepared"
 FORMAT: Final = 1
 
 _LAYOUT: Final = 2
-"""Shards of another layout are written anew: those of 1 had one mask of validity for both tasks."""
+"""Shards of another layout are written anew."""
 
 _ENTRY: Final = frozenset({"name", "size", "boxes", "class_id", "ignored", "attributes", "parts"})
 """What every line of an index holds."""
@@ -289,8 +289,7 @@ class PreparedDataset:
                 raise DataError(f"{_index_name(shard)}: is empty; prepare the data set again")
             self._lines += lines
             self._shard_of += [number] * len(lines)
-        prepared = state["counts"].get(split, len(self))
-        if len(self) != prepared:
+        if len(self) != (prepared := state["counts"][split]):
             raise DataError(
                 f"{root}: the index of {split} holds {len(self)} images, not {prepared}; prepare the data set again"
             )
@@ -626,15 +625,15 @@ def _read_state(folder: Path) -> dict[str, Any]:
     path = folder / PREPARED_FILE
     cure = f"remove {folder} and prepare the data set again"
     try:
-        state = parse_json(path.read_bytes())
+        state: dict[str, Any] = parse_json(path.read_bytes())
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be read ({error}); {cure}") from error
     found = state.get("format") if isinstance(state, dict) else None
     if found != FORMAT:
         raise DataError(f"{path}: format {found!r}, not {FORMAT}; {cure}")
-    if missing := {"canvas", "class_names", "mask_above", "splits", "shards"} - state.keys():
+    if missing := {"canvas", "class_names", "mask_above", "splits", "shards", "counts"} - state.keys():
         raise DataError(f"{path}: lacks {', '.join(sorted(missing))}; {cure}")
-    return {"counts": {}, **state}  # which earlier versions did not write
+    return state
 
 
 def _files_of(root: Path, split: str) -> Iterator[str]:

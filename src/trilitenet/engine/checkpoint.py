@@ -20,13 +20,18 @@ CHECKPOINT_SCHEMA: Final = 1
 
 _KEYS: Final[dict[str, type | tuple[type, ...]]] = {
     "config": dict,
+    "classes": int,
+    "data": (dict, type(None)),
     "step": int,
     "network": dict,
     "ema": (dict, type(None)),
     "optimiser": dict,
     "loss": dict,
+    "scaler": dict,
     "best": dict,
     "metrics": dict,
+    "stale": int,
+    "ended": int,
     "random": dict,
 }
 """What every checkpoint holds, and its types."""

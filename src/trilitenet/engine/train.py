@@ -568,14 +568,14 @@ class Trainer:
         """
         state = read_checkpoint(path)
         ours, theirs = self.config.to_dict(), state["config"]
-        ours["class count"], theirs["class count"] = self.network.classes, state.get("classes", self.network.classes)
+        ours["class count"], theirs["class count"] = self.network.classes, state["classes"]
         for name in (*SAME_ON_RESUME, "class count"):
             if theirs.get(name, ours[name]) != ours[name]:
                 raise WeightsError(
                     f"{path}: was trained with {name} {theirs[name]!r}, this run has {ours[name]!r}; "
                     "set it alike, or start anew with --init"
                 )
-        if state.get("data") and self.identity:
+        if state["data"] and self.identity:
             difference = tell_apart(state["data"], self.identity)
             if difference:
                 raise WeightsError(
@@ -616,10 +616,9 @@ class Trainer:
         for group, (weight_decay, betas) in zip(self.optimiser.param_groups, settings, strict=True):
             group.update(weight_decay=weight_decay, betas=betas)  # as this run says, like the learning rate
         self.loss.load_state_dict(state["loss"])
-        if state.get("scaler"):
+        if state["scaler"]:
             self.fabric._precision.load_state_dict(state["scaler"])
-        self.step, self.stale = int(state["step"]), int(state.get("stale", 0))
-        self.ended = int(state.get("ended", self.step))
+        self.step, self.stale, self.ended = state["step"], state["stale"], state["ended"]
         self.best = dict(state["best"])
         self.metrics = {} if self.validate is None else dict(state["metrics"])  # else those of other weights at the end
         set_random_state(state["random"])

@@ -140,10 +140,8 @@ def _read(path: Path) -> tuple[ModelCard, ArtefactInfo]:
     if not isinstance(found, dict):
         raise WeightsError(f"{side}: not the metadata of an artefact (not an object)")
     card, info = read_metadata({key: json.dumps(value) for key, value in found.items()}, str(side))
-    parts = [(weights, "weights", WEIGHTS_HASH_KEY)]
-    if GRAPH_HASH_KEY in found:  # earlier versions wrote none
-        parts.append((path, "graph", GRAPH_HASH_KEY))  # of which NCNN takes a piece for a whole one
-    for file, what, key in parts:
+    # NCNN takes a piece of a graph for a whole one.
+    for file, what, key in ((weights, "weights", WEIGHTS_HASH_KEY), (path, "graph", GRAPH_HASH_KEY)):
         if hashlib.sha256(file.read_bytes()).hexdigest() != found.get(key):
             raise WeightsError(f"{file}: not the {what} that {side.name} was written for; export the model again")
     return card, info
