@@ -23,12 +23,13 @@ MISSED: Final = (86, 180, 233)
 """RGB of what only the truth has."""
 IGNORED: Final = (150, 150, 150)
 """RGB of ignored regions."""
+_WIDTH: Final = 480
 
 
-def shrunken(image: NDArray[np.uint8], width: int = 480) -> NDArray[np.uint8]:
-    """Return an (H, W, 3) image shrunk by a whole number, so that it is at most ``width`` pixels across."""
+def shrunken(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an (H, W, 3) image shrunk by a whole number, so that it is at most 480 pixels across."""
     height, full = image.shape[:2]
-    scale = 1 / -(-full // width)
+    scale = 1 / -(-full // _WIDTH)
     return _shrink(image, (max(1, round(full * scale)), max(1, round(height * scale))))
 
 

@@ -22,6 +22,8 @@ __all__ = ["CudaGraphBackend"]
 
 _WARM_UP: Final = 3
 """Runs before a capture, in which cuDNN chooses its kernels and the allocator grows."""
+_SHAPES: Final = 8
+"""So many batch shapes stay captured; the one longest unused makes room."""
 
 
 class _Captured(NamedTuple):
@@ -43,19 +45,13 @@ class CudaGraphBackend:
             lacks. It must do the same work on every call.
         card: What the network is.
         device: A CUDA device.
-        shapes: So many batch shapes stay captured; the one longest unused makes room.
 
     Raises:
         BackendError: If the device is not CUDA or not there.
     """
 
     def __init__(
-        self,
-        graph: Callable[[Tensor], Sequence[Tensor | None]],
-        card: ModelCard,
-        device: str = "cuda",
-        *,
-        shapes: int = 8,
+        self, graph: Callable[[Tensor], Sequence[Tensor | None]], card: ModelCard, device: str = "cuda"
     ) -> None:
         self.device = pick_device(device)
         if self.device.type != "cuda":
@@ -64,7 +60,6 @@ class CudaGraphBackend:
             graph.to(self.device).eval() if isinstance(graph, torch.nn.Module) else graph
         )
         self._card = card
-        self._shapes = shapes
         self._captured: collections.OrderedDict[tuple[int, ...], _Captured] = collections.OrderedDict()
         self._lock = threading.Lock()
 
@@ -119,7 +114,7 @@ class CudaGraphBackend:
         if shape in self._captured:
             self._captured.move_to_end(shape)
             return self._captured[shape]
-        while len(self._captured) >= self._shapes:
+        while len(self._captured) >= _SHAPES:
             self._captured.popitem(last=False)
         host = torch.zeros(shape, dtype=torch.uint8, pin_memory=True)
         pixels = host.to(self.device)

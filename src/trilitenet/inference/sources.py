@@ -289,7 +289,6 @@ class StreamReader(FrameReader):
         retries: Give up after so many attempts in a row that brought no frame.
         backoff: Seconds before the first new attempt.
         longest: Seconds between attempts at most.
-        timeout: Seconds without data that count as a break.
 
     Attributes:
         reconnections: How often it was picked up again.
@@ -305,12 +304,11 @@ class StreamReader(FrameReader):
         retries: int = 8,
         backoff: float = 0.5,
         longest: float = 30.0,
-        timeout: float = _PATIENCE,
     ) -> None:
         super().__init__(_without_secrets(url), clip)
         self._url = url
         self.expected = self.clip.expected(None, None)
-        self.retries, self.backoff, self.longest, self.timeout = retries, backoff, longest, timeout
+        self.retries, self.backoff, self.longest = retries, backoff, longest
         self.reconnections = 0
 
     def _decode(self) -> Any:
@@ -325,7 +323,7 @@ class StreamReader(FrameReader):
                     return
             attempt += 1
             try:
-                with _open_container(self._url, self.name, timeout=self.timeout) as container:
+                with _open_container(self._url, self.name, timeout=_PATIENCE) as container:
                     offset: float | None = None
                     for timestamp, make in _frames_of(container, self):
                         if offset is None:

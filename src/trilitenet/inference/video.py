@@ -37,6 +37,10 @@ T = TypeVar("T")
 
 _CLOCK: Final = 90_000
 """Ticks a second of the time stamps in written videos."""
+_BATCHES_AHEAD: Final = 2
+"""Batches that may wait between two stages of a stream."""
+_FRAMES_AHEAD: Final = 8
+"""Frames that may wait for the encoder."""
 
 
 class Prefetch(Generic[T]):
@@ -127,29 +131,23 @@ class PerceptionStream(Generic[T]):
     Args:
         source: Pictures, or the frames of a video.
         predictor: The predictor; frames of a file go through it ``predictor.batch_size`` at a time.
-        ahead: Batches that may wait between two stages.
     """
 
     @overload
-    def __init__(
-        self: PerceptionStream[Perception], source: FrameReader, predictor: Predictor, *, ahead: int = 2
-    ) -> None: ...
+    def __init__(self: PerceptionStream[Perception], source: FrameReader, predictor: Predictor) -> None: ...
     @overload
     def __init__(
-        self: PerceptionStream[Perception | Failure],
-        source: Stills | FrameReader,
-        predictor: Predictor,
-        *,
-        ahead: int = 2,
+        self: PerceptionStream[Perception | Failure], source: Stills | FrameReader, predictor: Predictor
     ) -> None: ...
 
-    def __init__(self, source: Stills | FrameReader, predictor: Predictor, *, ahead: int = 2) -> None:
+    def __init__(self, source: Stills | FrameReader, predictor: Predictor) -> None:
         self._source = source
         live = isinstance(source, FrameReader) and source.live
         batch_size = 1 if live else predictor.batch_size
         items: Iterable[Frame | Failure] = source
-        self._frames = Prefetch(items, 1 if live else ahead * batch_size, drop_oldest=live)
-        self._perceptions: Prefetch[Any] = Prefetch(_perceive(self._frames, predictor, batch_size), ahead * batch_size)
+        ahead = _BATCHES_AHEAD * batch_size
+        self._frames = Prefetch(items, 1 if live else ahead, drop_oldest=live)
+        self._perceptions: Prefetch[Any] = Prefetch(_perceive(self._frames, predictor, batch_size), ahead)
 
     @property
     def dropped(self) -> int:
@@ -233,7 +231,6 @@ class VideoWriter:
         rate: Frames a second, for time stamps that are missing and for the encoder's rate control.
         quality: Constant rate factor, 0 (best) to 51.
         preset: x264's trade of speed for size.
-        ahead: Frames that may wait for the encoder.
 
     Attributes:
         frames: Frames given so far.
@@ -245,13 +242,7 @@ class VideoWriter:
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        rate: float | None = None,
-        *,
-        quality: int = 23,
-        preset: str = "superfast",
-        ahead: int = 8,
+        self, path: str | Path, rate: float | None = None, *, quality: int = 23, preset: str = "superfast"
     ) -> None:
         self._av = import_extra("av", "video")
         self.path = path = Path(path)
@@ -268,7 +259,7 @@ class VideoWriter:
         self._container: Any = None
         self._stream: Any = None
         self._last = -1
-        self._waiting: queue.Queue[tuple[NDArray[np.uint8], float] | None] = queue.Queue(ahead)
+        self._waiting: queue.Queue[tuple[NDArray[np.uint8], float] | None] = queue.Queue(_FRAMES_AHEAD)
         self._error: OutputError | None = None
         self._closed = False
         self._thread = threading.Thread(target=self._run, daemon=True)

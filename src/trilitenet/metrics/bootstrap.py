@@ -69,10 +69,10 @@ def bootstrap(
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
 
 
-def interval(values: FloatArray, level: float = 0.95) -> tuple[float, float]:
-    """Return the range of the middle ``level`` of the values, NaN left out; NaN if nothing is left."""
+def interval(values: FloatArray) -> tuple[float, float]:
+    """Return the range of the middle 95% of the values, NaN left out; NaN if nothing is left."""
     known = values[~np.isnan(values)]
     if not len(known):
         return float("nan"), float("nan")
-    low, high = np.quantile(known, [(1 - level) / 2, (1 + level) / 2])
+    low, high = np.quantile(known, [0.025, 0.975])
     return float(low), float(high)

@@ -46,11 +46,11 @@ class BatchNormPReLU(nn.Module):
 
 
 class ConvBNPReLU(nn.Module):
-    """k x k convolution without bias, batch normalisation, PReLU: (B, C, H, W) -> (B, out, H / stride, W / stride)."""
+    """3x3 convolution without bias, batch normalisation, PReLU: (B, C, H, W) -> (B, out, H / stride, W / stride)."""
 
-    def __init__(self, in_channels: int, out_channels: int, kernel: int = 3, stride: int = 1) -> None:
+    def __init__(self, in_channels: int, out_channels: int, *, stride: int = 1) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(in_channels, out_channels, kernel, stride, padding=kernel // 2, bias=False)
+        self.conv = nn.Conv2d(in_channels, out_channels, 3, stride, padding=1, bias=False)
         self.bn = batch_norm(out_channels)
         self.act = PReLU(out_channels)
 

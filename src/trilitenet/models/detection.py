@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Final
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +14,9 @@ from trilitenet.config import STRIDES
 from trilitenet.models.blocks import DepthwiseSeparableConv
 
 __all__ = ["SPP", "DetectionHead", "LitePAN", "decode_level"]
+
+_ANCHORS: Final = 3
+"""Of a level."""
 
 
 class SPP(nn.Module):
@@ -66,11 +70,10 @@ class LitePAN(nn.Module):
 class DetectionHead(nn.Module):
     """One 1x1 convolution a level: 3 anchors x (4 box + 1 objectness + classes) logits a cell."""
 
-    def __init__(self, channels: int, classes: int, anchors_per_level: int = 3) -> None:
+    def __init__(self, channels: int, classes: int) -> None:
         super().__init__()
         self.classes = classes
-        self.anchors_per_level = anchors_per_level
-        self.convs = nn.ModuleList(nn.Conv2d(channels, anchors_per_level * (5 + classes), 1) for _ in STRIDES)
+        self.convs = nn.ModuleList(nn.Conv2d(channels, _ANCHORS * (5 + classes), 1) for _ in STRIDES)
         self._initialise_biases()
 
     @torch.no_grad()
@@ -79,7 +82,7 @@ class DetectionHead(nn.Module):
         for conv, stride in zip(self.convs, STRIDES, strict=True):
             assert isinstance(conv, nn.Conv2d)
             assert conv.bias is not None
-            bias = conv.bias.view(self.anchors_per_level, -1)
+            bias = conv.bias.view(_ANCHORS, -1)
             bias[:, 4] += math.log(8 / (640 / stride) ** 2)
             bias[:, 5:] += math.log(0.6 / (self.classes - 0.99))
 
@@ -89,7 +92,7 @@ class DetectionHead(nn.Module):
         for conv, x in zip(self.convs, levels, strict=True):
             y = conv(x)
             batch, _, height, width = y.shape
-            outputs.append(y.view(batch, self.anchors_per_level, -1, height, width).permute(0, 1, 3, 4, 2))
+            outputs.append(y.view(batch, _ANCHORS, -1, height, width).permute(0, 1, 3, 4, 2))
         return outputs[0], outputs[1], outputs[2]
 
 

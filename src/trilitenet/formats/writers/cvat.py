@@ -26,6 +26,8 @@ __all__ = ["CvatWriter", "cvat_mask"]
 _HEAD = '<?xml version="1.0" encoding="utf-8"?>\n<annotations>\n  <version>1.1</version>\n'
 
 _LINE = "lane line"
+_TOLERANCE = 1.0
+"""A polygon of a video leaves the mask's outline by at most so many pixels."""
 
 
 class CvatWriter(Writer):
@@ -33,17 +35,13 @@ class CvatWriter(Writer):
 
     CVAT lists a video by track, not by frame, so the shapes of one video are held until it ends: about 4 KB a frame,
     and 300 bytes a box without a track.
-
-    Args:
-        tolerance: A polygon leaves the mask's outline by at most so many pixels.
     """
 
     PICTURE_FILES = ("cvat-images.xml",)
     VIDEO_FILES = ("{}.cvat-video.xml",)
 
-    def __init__(self, output: Path, *, overwrite: bool = False, tolerance: float = 1.0) -> None:
+    def __init__(self, output: Path, *, overwrite: bool = False) -> None:
         super().__init__(output, overwrite=overwrite)
-        self.tolerance = tolerance
         self._images: _ImagesFile | None = None
         self._video: _VideoFile | None = None
 
@@ -58,7 +56,7 @@ class CvatWriter(Writer):
         if self._video is None or self._video.source != perception.source:
             self._close_video()
             self._video = _VideoFile(self.create(f"{self.stem(perception.source)}.cvat-video.xml"), perception)
-        self._video.add(perception, self.tolerance, road)
+        self._video.add(perception, road)
 
     def _close(self) -> None:
         """Finish the files."""
@@ -203,11 +201,11 @@ class _VideoFile:
         self._frames: list[int] = []
         self._tracks: dict[object, _Track] = {}
 
-    def add(self, perception: Perception, tolerance: float, road: Mapping[str, Any] | None) -> None:
+    def add(self, perception: Perception, road: Mapping[str, Any] | None) -> None:
         frame = perception.frame or 0
         self._frames.append(frame)
         for label, mask in (("drivable", perception.drivable), ("lane", perception.lane)):
-            polygons = [] if mask is None else mask_to_polygons(mask, tolerance=tolerance)
+            polygons = [] if mask is None else mask_to_polygons(mask, tolerance=_TOLERANCE)
             for rank, polygon in enumerate(polygons):
                 track = self._tracks.setdefault((label, rank), _Track(label, "polygon"))
                 track.shapes[frame] = (f'points="{_points((polygon + 0.5).tolist())}"', "")
