@@ -36,7 +36,9 @@ __all__ = [
     "VARIANTS",
     "Anchors",
     "ArtefactInfo",
+    "Masks",
     "ModelCard",
+    "Precision",
     "Task",
     "Thresholds",
     "VariantConfig",
@@ -53,7 +55,11 @@ __all__ = [
 ]
 
 Task = Literal["detection", "drivable", "lane"]
-TASKS: Final[tuple[Task, ...]] = ("detection", "drivable", "lane")
+TASKS: Final[tuple[Task, ...]] = get_args(Task)
+Precision = Literal["fp32", "fp16", "bf16", "int8"]
+"""What an exported artefact is stored in."""
+Masks = Literal["decision", "probability", "logit"]
+"""What a mask holds: 0 or 1, probability x 255, or foreground minus background logit minus the threshold's."""
 
 IMAGE_MEAN: Final = (0.485, 0.456, 0.406)
 """Mean of RGB / 255 that the network's input is normalised with (ImageNet's)."""
@@ -260,11 +266,11 @@ class ArtefactInfo:
 
     Attributes:
         format: ``"onnx"``, ``"openvino"``, ``"ncnn"``, ``"tensorrt"`` or ``"torch"``.
-        precision: ``"fp32"``, ``"fp16"``, ``"bf16"`` or ``"int8"``.
+        precision: See `Precision`.
         size: (height, width) of the input in pixels; None if any multiples of 32 will do.
         input: ``"uint8_nhwc"``: (B, H, W, 3) uint8, or ``"float_nchw"``: (B, 3, H, W) float32 of 0 .. 255. B is 1.
         colour: ``"rgb"`` or ``"bgr"``.
-        masks: ``"decision"`` (0 or 1), ``"probability"`` (x 255), or ``"logit"`` (foreground where above 0).
+        masks: See `Masks`.
         mask_scale: Mask pixels an input pixel, along an axis.
         nms: Whether detections have been through non-maximum suppression.
         trilitenet: Version of the package that wrote it.
@@ -272,11 +278,11 @@ class ArtefactInfo:
     """
 
     format: str
-    precision: Literal["fp32", "fp16", "bf16", "int8"] = "fp32"
+    precision: Precision = "fp32"
     size: tuple[int, int] | None = None
     input: Literal["uint8_nhwc", "float_nchw"] = "uint8_nhwc"
     colour: Literal["rgb", "bgr"] = "rgb"
-    masks: Literal["decision", "probability", "logit"] = "decision"
+    masks: Masks = "decision"
     mask_scale: int = 1
     nms: bool = False
     trilitenet: str = ""

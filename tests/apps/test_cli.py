@@ -371,8 +371,8 @@ def test_no_second_value_is_taken_for_a_file(
 
 
 def test_the_values_that_may_follow_are_those_that_there_are() -> None:
-    from trilitenet.commands.export import Precision
     from trilitenet.commands.load import BACKENDS
+    from trilitenet.config import Precision
     from trilitenet.formats.writers.base import WRITERS
     from trilitenet.models.trilitenet import build_network
     from trilitenet.processing.drawing import PARTS

@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import cv2
 from cyclopts import Parameter
@@ -39,6 +39,8 @@ from trilitenet.processing.cores import usable_cores
 from trilitenet.processing.letterbox import Letterbox
 
 __all__ = ["Checked", "Converted", "Prepared", "Shown", "check", "convert", "prepare", "show"]
+
+Kind = Literal["bdd100k", "coco", "yolo", "cvat", "masks"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +94,7 @@ def convert(
     target: StrPath | None = None,
     /,
     *,
-    kind: Annotated[Literal["bdd100k", "coco", "yolo", "cvat", "masks"] | None, Parameter(name="--from")] = None,
+    kind: Annotated[Kind | None, Parameter(name="--from")] = None,
     classes: StrPath | None = None,
     splits: Sequence[str] = (),
     lane_width: Sequence[str] = (),
@@ -421,9 +423,8 @@ def _arguments(source: str, output: StrPath, target: StrPath | None, kind: str |
         kind, source, output = source, str(output), target
     elif target is not None:
         raise ConfigError("with --from, give SOURCE and OUTPUT alone")
-    known = ("bdd100k", "coco", "yolo", "cvat", "masks")
-    if kind not in known:
-        raise ConfigError(f"unknown kind of data set {kind!r}; known: {', '.join(known)}")
+    if kind not in get_args(Kind):
+        raise ConfigError(f"unknown kind of data set {kind!r}; known: {', '.join(get_args(Kind))}")
     return kind, source, Path(output)
 
 

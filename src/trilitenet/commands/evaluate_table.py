@@ -13,17 +13,10 @@ from pathlib import Path
 from typing import Final, Literal
 
 from trilitenet.commands.evaluate import evaluate, hash_dataset, hash_model, known_report
-from trilitenet.commands.export import (
-    PRECISIONS,
-    Precision,
-    check_drop,
-    drop_frames,
-    export,
-    find_pictures,
-)
+from trilitenet.commands.export import PRECISIONS, check_drop, drop_frames, export, find_pictures
 from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, one_for_several
 from trilitenet.commands.tables import PAPER_COLUMNS, markdown_row
-from trilitenet.config import ARTEFACT_SUFFIXES, VARIANTS
+from trilitenet.config import ARTEFACT_SUFFIXES, VARIANTS, Precision
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.provenance import hash_files
 from trilitenet.errors import ConfigError, write_file

@@ -20,9 +20,18 @@ from torch.nn.functional import interpolate
 import trilitenet
 from trilitenet.commands.load import open_backend
 from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, optional_path
-from trilitenet.config import ARTEFACT_KEY, ARTEFACT_SUFFIXES, CARD_KEY, ArtefactInfo, Task, check_size
+from trilitenet.config import (
+    ARTEFACT_KEY,
+    ARTEFACT_SUFFIXES,
+    CARD_KEY,
+    ArtefactInfo,
+    Masks,
+    Precision,
+    Task,
+    check_size,
+)
 from trilitenet.data.reading import DrivingDataset, is_image_file
-from trilitenet.deploy.graph import DeployGraph, Masks, Traceable
+from trilitenet.deploy.graph import DeployGraph, Traceable
 from trilitenet.deploy.layouts import pick_layout
 from trilitenet.deploy.ncnn import build_ncnn, save_ncnn
 from trilitenet.deploy.onnx import build_onnx, save_onnx
@@ -57,14 +66,12 @@ __all__ = [
     "DROP_FRAMES",
     "PRECISIONS",
     "Exported",
-    "Precision",
     "drop_frames",
     "export",
     "find_pictures",
 ]
 
 Format = Literal["onnx", "openvino", "ncnn", "tensorrt", "torch", "triton"]
-Precision = Literal["fp32", "fp16", "bf16", "int8"]
 _Item = TypeVar("_Item")
 
 PRECISIONS: Final[dict[str, tuple[Precision, ...]]] = {

@@ -7,13 +7,13 @@ sums inside ESP blocks, no transposed convolution at the end (where the layout i
 
 from __future__ import annotations
 
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from trilitenet.config import MAX_STRIDE, STRIDES, ArtefactInfo, ModelCard, Thresholds
+from trilitenet.config import MAX_STRIDE, STRIDES, ArtefactInfo, Masks, ModelCard, Thresholds
 from trilitenet.deploy.layers import (
     Activation,
     DepthwiseESPGraph,
@@ -55,11 +55,8 @@ from trilitenet.models.detection import DetectionHead, LitePAN
 from trilitenet.models.segmentation import SegmentationHead, UpStage
 from trilitenet.models.trilitenet import TriLiteNet, foreign_layers
 
-__all__ = ["MASKS", "DeployGraph", "DeployOutputs", "Masks", "Traceable"]
+__all__ = ["DeployGraph", "DeployOutputs", "Traceable"]
 
-Masks = Literal["decision", "probability", "logit"]
-"""What a mask holds: 0 or 1, probability x 255, or foreground minus background logit minus the threshold's."""
-MASKS: Final[tuple[Masks, ...]] = ("decision", "probability", "logit")
 REDUCED: Final = (torch.float16, torch.bfloat16)
 
 
@@ -387,8 +384,8 @@ class DeployGraph(nn.Module):
         thresholds: Thresholds | None = None,
     ) -> None:
         super().__init__()
-        if masks not in MASKS:
-            raise ConfigError(f"unknown masks {masks!r}; known: {', '.join(MASKS)}")
+        if masks not in get_args(Masks):
+            raise ConfigError(f"unknown masks {masks!r}; known: {', '.join(get_args(Masks))}")
         if mask_scale not in (1, 2) or (mask_scale == 2 and masks != "decision"):
             raise ConfigError(f"mask_scale is 1, or 2 with masks='decision'; got {mask_scale} with {masks!r}")
         _check_layers(network)
