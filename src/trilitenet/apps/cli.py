@@ -101,12 +101,11 @@ _SPINS: Final = "10000"
 where there is other work; fewer make a training, which has the cores to itself, 7% slower."""
 
 
-def build_app(words: Sequence[str] = (), *, everything: bool = False) -> cyclopts.App:
+def build_app(words: Sequence[str] = ()) -> cyclopts.App:
     """Build the command line.
 
     Args:
         words: What the user typed: only the command that they name is imported.
-        everything: Import every command, as a generator of documentation needs.
     """
     app = cyclopts.App(
         name="trilitenet",
@@ -122,7 +121,7 @@ def build_app(words: Sequence[str] = (), *, everything: bool = False) -> cyclopt
     for command in COMMANDS:
         parts = command.words.split()
         parent = groups[parts[0]] if len(parts) == 2 else app
-        if everything or command is called:
+        if command is called:
             parent.command(command.load(), name=parts[-1])
         elif called is None:
             parent.command(_placeholder, name=parts[-1], help=command.read_summary())
@@ -218,7 +217,7 @@ def main(words: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader, such as `head`, has gone
         _discard_output()
     except OSError as error:
-        printed = not words or {"--help", "-h", "--version"} & set(words)
+        printed = not words or set(_ROOT_OPTIONS) & set(words)
         if printed or (words[:2] == ["weights", "info"] and error.filename is None):  # what writes by itself
             return _fail(_output_failed(error), code=1)
         if error.filename is None:

@@ -1,4 +1,4 @@
-"""Where and how a run computes: Lightning Fabric for device, precision and processes; signals; non-finite steps."""
+"""Where and how a run computes: Lightning Fabric for device, precision and processes; signals."""
 
 from __future__ import annotations
 

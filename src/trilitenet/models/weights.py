@@ -26,8 +26,8 @@ from trilitenet.config import (
     CARD_KEY,
     STRIDES,
     VARIANTS,
-    Anchors,
     ModelCard,
+    check_anchors,
     get_variant,
     shipped_weights,
 )
@@ -128,7 +128,7 @@ def save_network(network: TriLiteNet, path: str | os.PathLike[str], card: ModelC
         variant=network.variant,
         tasks=network.tasks,
         blocks=network.blocks,
-        anchors=_anchors_of(network.anchors),
+        anchors=check_anchors(network.anchors),
     )
     tensors = {}
     for name, tensor in network.state_dict().items():
@@ -215,7 +215,7 @@ def import_published(
         raise WeightsError(f"{source}: holds the {guessed} variant, not {variant}; leave --variant out or correct it")
     anchors = _published_anchors(state, source)
     classes = _published_classes(state, source)
-    network = build_network(guessed, classes, anchors=_anchors_of(anchors))
+    network = build_network(guessed, classes, anchors=anchors)
     ours = {
         rename_published(key): value
         for key, value in state.items()
@@ -240,13 +240,6 @@ def rename_published(key: str) -> str:
         if count:
             return renamed
     return key
-
-
-def _anchors_of(tensor: Tensor) -> Anchors:
-    return tuple(
-        tuple((float(width), float(height)) for width, height in level)
-        for level in tensor.detach().cpu().view(len(STRIDES), -1, 2).tolist()
-    )
 
 
 def _open(path: Path, *, tensors: bool) -> tuple[ModelCard, dict[str, Tensor]]:
