@@ -6,9 +6,28 @@ import cv2
 import numpy as np
 import pytest
 
+from trilitenet.data.converting import ConversionOptions, convert
+from trilitenet.data.reading import DrivingDataset
+from trilitenet.data.records import RecordSource
 from trilitenet.structures import Boxes, Perception
 
+CLASSES: dict[str, tuple[str, ...]] = {"car": ("car",), "truck": ("truck",)}
 SIZE = (48, 80)
+
+
+def check_round_trip(source: RecordSource, wanted: list[Perception], out: Path, within: float = 0.011) -> None:
+    """Check that what a writer wrote is read and converted as it was; ``within`` is of boxes, in pixels."""
+    convert(source, out, ConversionOptions(classes=CLASSES))
+    dataset = DrivingDataset(out, "train")
+    assert dataset.names == ["one", "two"]
+    for sample, perception in zip(dataset, wanted, strict=True):
+        assert perception.boxes is not None
+        assert sample.boxes is not None
+        np.testing.assert_allclose(sample.boxes, perception.boxes.xyxy, atol=within)
+        np.testing.assert_array_equal(sample.class_id, perception.boxes.class_id)
+        for mask, own in ((sample.drivable, perception.drivable), (sample.lane, perception.lane)):
+            assert (mask is None) == (own is None)
+            np.testing.assert_array_equal(mask, own)
 
 
 @pytest.fixture

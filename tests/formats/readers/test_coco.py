@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.formats.readers.conftest import SIZE
+from tests.formats.readers.conftest import CLASSES, SIZE, check_round_trip
 from trilitenet.data.converting import ConversionOptions, convert
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.errors import DataError, OutputError
@@ -17,24 +17,13 @@ from trilitenet.formats.readers.mapping import LabelMapping
 from trilitenet.formats.writers.base import open_writer
 from trilitenet.structures import Perception
 
-CLASSES: dict[str, tuple[str, ...]] = {"car": ("car",), "truck": ("truck",)}
-
 
 def test_what_the_writer_writes_comes_back(perceptions: list[Perception], tmp_path: Path) -> None:
     with open_writer("coco", tmp_path / "data") as writer:
         for perception in perceptions:
             writer.write(perception)
     source = read_coco(tmp_path / "data", LabelMapping(classes=CLASSES))
-    convert(source, tmp_path / "out", ConversionOptions(classes=CLASSES))
-    dataset = DrivingDataset(tmp_path / "out", "train")
-    assert dataset.names == ["one", "two"]
-    for sample, perception in zip(dataset, perceptions, strict=True):
-        assert perception.boxes is not None
-        assert sample.boxes is not None
-        np.testing.assert_allclose(sample.boxes, perception.boxes.xyxy, atol=0.011)
-        np.testing.assert_array_equal(sample.class_id, perception.boxes.class_id)
-        np.testing.assert_array_equal(sample.drivable, perception.drivable)
-        np.testing.assert_array_equal(sample.lane, perception.lane)
+    check_round_trip(source, perceptions, tmp_path / "out")
 
 
 def coco(**more: Any) -> dict[str, Any]:
