@@ -1006,10 +1006,6 @@ def test_the_first_process_alone_tells_the_result(tmp_path: Path) -> None:
     assert dataclasses.replace(result, first=False).summary() == ""
 
 
-def test_engine_names_the_figures_validation_returns() -> None:
-    assert set(engine.FIGURES) == {"detection", "drivable", "lane"}
-
-
 class _Made(Exception):  # noqa: N818 - no error, but far enough
     """What a run is made of."""
 
