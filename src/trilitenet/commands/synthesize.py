@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
 
 from trilitenet.commands.paths import StrPath
 from trilitenet.commands.progress import show_progress
+from trilitenet.data.synthetic import LaneLabels
 from trilitenet.data.synthetic_files import write_dataset
 
 __all__ = ["Synthesized", "synthesize"]
@@ -39,7 +39,7 @@ def synthesize(
     seed: int = 0,
     split: str = "train",
     size: tuple[int, int] = (384, 640),
-    labels: Literal["lines", "paint"] = "lines",
+    labels: LaneLabels = "lines",
     workers: int = 1,
 ) -> Synthesized:
     """Write synthetic road scenes with labels for all three tasks, in the published layout.

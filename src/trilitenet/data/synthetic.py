@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,10 @@ from trilitenet.errors import ConfigError
 from trilitenet.processing.geometry import Camera
 
 __all__ = ["LineTruth", "ObjectTruth", "Scene", "SceneTruth", "SyntheticScenes"]
+
+LaneLabels = Literal["lines", "paint"]
+LineKind = Literal["solid", "dashed", "double", "kerb"]
+LineColour = Literal["white", "yellow", "none"]
 
 MIN_SIDE: Final = 7.0
 """A vehicle lower or narrower than this many pixels at 640 pixels of image width is ignored."""
@@ -45,8 +49,8 @@ class LineTruth:
     d: float
     points: NDArray[np.float64]
     polynomial: NDArray[np.float64]
-    kind: Literal["solid", "dashed", "double", "kerb"]
-    colour: Literal["white", "yellow", "none"]
+    kind: LineKind
+    colour: LineColour
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -137,10 +141,10 @@ class SyntheticScenes:
         size: tuple[int, int] = (384, 640),
         count: int = 1_000_000,
         *,
-        labels: Literal["lines", "paint"] = "lines",
+        labels: LaneLabels = "lines",
         faults: bool = True,
     ) -> None:
-        if labels not in ("lines", "paint"):
+        if labels not in get_args(LaneLabels):
             raise ConfigError(f"labels must be 'lines' or 'paint', got {labels!r}")
         size = as_size(size)
         if min(size) < 32:
@@ -183,7 +187,13 @@ _SCENES: Final = {
 
 
 def label_scene(
-    world: World, drawn: Rendering, name: str, *, labels: str = "lines", speed: float = 0.0, timestamp: float = 0.0
+    world: World,
+    drawn: Rendering,
+    name: str,
+    *,
+    labels: LaneLabels = "lines",
+    speed: float = 0.0,
+    timestamp: float = 0.0,
 ) -> Scene:
     """Turn a drawn world into a sample and its truth.
 
@@ -232,9 +242,7 @@ def _lines(world: World) -> tuple[LineTruth, ...]:
     twins = [mark.d for mark in layout.markings if mark.twin]
     found: list[LineTruth] = []
 
-    def add(
-        d: float, kind: Literal["solid", "dashed", "double", "kerb"], colour: Literal["white", "yellow", "none"]
-    ) -> None:
+    def add(d: float, kind: LineKind, colour: LineColour) -> None:
         points = course.line(d)
         near = points[:, 0] <= 60
         polynomial = np.polynomial.polynomial.polyfit(points[near, 0], points[near, 1], 3)

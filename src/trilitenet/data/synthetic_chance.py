@@ -17,7 +17,9 @@ from trilitenet.data.synthetic_world import (
     Light,
     Marking,
     SceneKind,
+    TimeOfDay,
     Vehicle,
+    Weather,
     World,
 )
 from trilitenet.processing.geometry import Camera
@@ -90,10 +92,8 @@ def random_camera(rng: np.random.Generator, size: tuple[int, int]) -> Camera:
 
 def random_light(rng: np.random.Generator) -> Light:
     """Draw time of day and weather."""
-    time: Literal["day", "dusk", "night"] = rng.choice(["day", "dusk", "night"], p=[0.64, 0.14, 0.22])
-    weather: Literal["clear", "overcast", "rain", "fog"] = rng.choice(
-        ["clear", "overcast", "rain", "fog"], p=[0.45, 0.33, 0.14, 0.08]
-    )
+    time: TimeOfDay = rng.choice(["day", "dusk", "night"], p=[0.64, 0.14, 0.22])
+    weather: Weather = rng.choice(["clear", "overcast", "rain", "fog"], p=[0.45, 0.33, 0.14, 0.08])
     tint = rng.normal(0.0, 0.025, 3)
 
     def gain(level: float, warm: float = 0.0) -> Colour:

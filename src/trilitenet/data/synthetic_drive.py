@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from trilitenet.config import as_size
 from trilitenet.data.synthetic import Scene, label_scene
 from trilitenet.data.synthetic_chance import random_layout, random_light, random_scenery, random_vehicle
 from trilitenet.data.synthetic_render import render
-from trilitenet.data.synthetic_world import FAR, Course, Item, Layout, Light, Vehicle, World
+from trilitenet.data.synthetic_world import FAR, Course, Item, Layout, Light, TimeOfDay, Vehicle, Weather, World
 from trilitenet.errors import ConfigError
 from trilitenet.processing.geometry import Camera
 
@@ -49,8 +49,8 @@ class SyntheticDrive:
         fps: float = 25.0,
         size: tuple[int, int] = (720, 1280),
         *,
-        time: Literal["day", "dusk", "night"] = "day",
-        weather: Literal["clear", "overcast", "rain", "fog"] = "clear",
+        time: TimeOfDay = "day",
+        weather: Weather = "clear",
         faults: bool = True,
     ) -> None:
         if frames < 1 or fps <= 0:

@@ -7,7 +7,6 @@ import functools
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from trilitenet.config import Task
 from trilitenet.data.description import DESCRIPTION_FILE, DatasetDescription, is_folder_name, write_description
 from trilitenet.data.reading import FOLDERS, IMAGE_FOLDER, label_file
 from trilitenet.data.sample import Sample
-from trilitenet.data.synthetic import SyntheticScenes
+from trilitenet.data.synthetic import LaneLabels, SyntheticScenes
 from trilitenet.errors import ConfigError, OutputError, replacing
 from trilitenet.processing.cores import ProcessPool
 
@@ -31,7 +30,7 @@ def write_dataset(
     seed: int = 0,
     *,
     size: tuple[int, int] = (384, 640),
-    labels: Literal["lines", "paint"] = "lines",
+    labels: LaneLabels = "lines",
     workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
@@ -107,7 +106,7 @@ def write_dataset(
 
 
 def _write_scene(
-    root: Path, split: str, seed: int, size: tuple[int, int], labels: Literal["lines", "paint"], count: int, index: int
+    root: Path, split: str, seed: int, size: tuple[int, int], labels: LaneLabels, count: int, index: int
 ) -> None:
     scenes = SyntheticScenes(seed, size, count, labels=labels)
     if not (root / IMAGE_FOLDER / split / f"{scenes.name(index)}.jpg").exists():

@@ -31,6 +31,8 @@ __all__ = [
 Floats = NDArray[np.float64]
 Colour = tuple[float, float, float]
 SceneKind = Literal["motorway", "country", "city", "residential", "one-way"]
+TimeOfDay = Literal["day", "dusk", "night"]
+Weather = Literal["clear", "overcast", "rain", "fog"]
 
 FAR: Final = 260.0
 """Metres ahead that the road is drawn to."""
@@ -208,8 +210,8 @@ class Light:
         wet: How wet the road is, in [0, 1].
     """
 
-    time: Literal["day", "dusk", "night"]
-    weather: Literal["clear", "overcast", "rain", "fog"]
+    time: TimeOfDay
+    weather: Weather
     ambient: Colour
     sun: float
     azimuth: float
