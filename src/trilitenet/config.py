@@ -50,6 +50,7 @@ __all__ = [
     "parse",
     "parse_json",
     "parse_yaml",
+    "plain",
     "read_yaml",
     "shipped_weights",
 ]
@@ -465,6 +466,15 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: must hold 'key: value' lines, got {type(content).__name__}")
     return {str(key): value for key, value in content.items()}
+
+
+def plain(value: Any) -> Any:
+    """Return mappings and sequences within each other with tuples as lists, which YAML writes without tags."""
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    return value
 
 
 def _read_versioned(cls: type[_T], text: str, source: str, what: str, newest: int) -> _T:

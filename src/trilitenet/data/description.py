@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import yaml
 
-from trilitenet.config import TASKS, Task, parse, read_yaml
+from trilitenet.config import TASKS, Task, parse, plain, read_yaml
 from trilitenet.errors import ConfigError, DataError, write_file
 
 __all__ = [
@@ -127,15 +127,6 @@ def read_description(root: Path) -> DatasetDescription:
 def write_description(root: Path, description: DatasetDescription) -> None:
     """Write ``root/dataset.yaml``, without the keys that hold their default."""
     default = dataclasses.asdict(DatasetDescription())
-    content = {key: _plain(value) for key, value in dataclasses.asdict(description).items() if value != default[key]}
-    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)
+    content = {key: value for key, value in dataclasses.asdict(description).items() if value != default[key]}
+    text = yaml.safe_dump(plain(content), sort_keys=False, allow_unicode=True, width=120)
     write_file(root / DESCRIPTION_FILE, text)
-
-
-def _plain(value: Any) -> Any:
-    """Return ``value`` with tuples as lists, which YAML writes without tags."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return value

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from trilitenet.config import TASKS, Anchors, Task, check_anchors, get_variant, parse, read_yaml
+from trilitenet.config import TASKS, Anchors, Task, check_anchors, get_variant, parse, plain, read_yaml
 from trilitenet.data.transforms import Augmentation
 from trilitenet.errors import ConfigError
 
@@ -204,15 +204,7 @@ class TrainConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists, numbers and strings, as YAML and checkpoints hold them."""
-        return _plain(dataclasses.asdict(self))  # type: ignore[no-any-return]
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (tuple, list)):
-        return [_plain(item) for item in value]
-    return value
+        return plain(dataclasses.asdict(self))  # type: ignore[no-any-return]
 
 
 def merge(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
