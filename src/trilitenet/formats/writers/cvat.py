@@ -11,7 +11,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
-from xml.sax.saxutils import quoteattr
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,11 +106,7 @@ def _labels(perception: Perception) -> str:
         "<mutable>True</mutable><input_type>text</input_type><default_value></default_value><values></values>"
         "</attribute></attributes></label>\n"
     )
-    return "      <labels>\n" + "".join(label.format(_text(name)) for name in names) + "      </labels>\n"
-
-
-def _text(value: str) -> str:
-    return value.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    return "      <labels>\n" + "".join(label.format(escape(name)) for name in names) + "      </labels>\n"
 
 
 def _points(points: list[list[float]]) -> str:
