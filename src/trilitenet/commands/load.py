@@ -6,9 +6,9 @@ import dataclasses
 import importlib.util
 import os
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from trilitenet.config import VARIANTS, ModelCard, Thresholds
+from trilitenet.config import VARIANTS
 from trilitenet.errors import ConfigError, did_you_mean, needing_torch
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.exported import is_int8_onnx
@@ -83,7 +83,9 @@ def load(
                 f"its input is fixed to {width}x{height}, so long_side has no effect; leave it out, or export it with "
                 "another --size"
             )
-        thresholds = _override(runtime.card, confidence=confidence, iou=iou, drivable=drivable, lane=lane)
+        given = {"confidence": confidence, "iou": iou, "drivable": drivable, "lane": lane}
+        own: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        thresholds = dataclasses.replace(runtime.card.thresholds, **own)
         return Predictor(runtime, thresholds, long_side=long_side, batch_size=batch_size)
     except ConfigError as error:
         runtime.close()
@@ -164,7 +166,3 @@ def _open_torch(model: str | os.PathLike[str], device: str, *, fastest: bool) ->
         graph.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         return CudaGraphBackend(graph, network.card, str(pick_device(device)))
     return TorchBackend(network, device)
-
-
-def _override(card: ModelCard, **given: float | None) -> Thresholds:
-    return dataclasses.replace(card.thresholds, **{name: value for name, value in given.items() if value is not None})  # type: ignore[arg-type]
