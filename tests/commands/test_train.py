@@ -315,10 +315,9 @@ def test_a_step_takes_one_exchange_between_processes(
     assert [asked.count(step) for step in (1, 2, 3)] == [1, 1, 1]
 
 
-@pytest.mark.parametrize("workers", [0, 1])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_saves_and_ends_cleanly(
-    scenes: Path, tmp_path: Path, number: signal.Signals, workers: int, monkeypatch: pytest.MonkeyPatch
+    scenes: Path, tmp_path: Path, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before, others = signal.getsignal(number), set(multiprocessing.active_children())
     plain = CsvLogger.log
@@ -327,19 +326,19 @@ def test_a_signal_saves_and_ends_cleanly(
         plain(self, values, step)
         if step == 3:
             helpers = set(multiprocessing.active_children()) - others
-            assert len(helpers) == workers
+            assert len(helpers) == 1
             processes = [str(process) for process in (os.getpid(), *(helper.pid for helper in helpers))]
             subprocess.run(["kill", f"-{number.value}", *processes], check=True)  # as a terminal or scheduler does
 
     monkeypatch.setattr(CsvLogger, "log", log)
-    result = train(**logged(scenes, tmp_path, max_steps=4, workers=workers))
+    result = train(**logged(scenes, tmp_path, max_steps=4, workers=1))
     assert (result.finished, result.steps, result.exit_code) == (False, 3, 130)
     assert "--resume" in result.summary()
     assert state(tmp_path)["step"] == 3
     assert not result.weights.exists()
     assert signal.getsignal(number) == before
     monkeypatch.setattr(CsvLogger, "log", plain)
-    assert train(resume=True, **logged(scenes, tmp_path, max_steps=4, workers=workers)).finished
+    assert train(resume=True, **logged(scenes, tmp_path, max_steps=4, workers=1)).finished
 
 
 def test_every_checkpoint_is_written_once_and_a_log_that_cannot_be_is_told(
@@ -889,9 +888,8 @@ def test_a_checkpoint_with_the_wrong_content_is_told_in_one_line(scenes: Path, b
 
 
 @pytest.mark.parametrize("recipe", RECIPES, ids=lambda path: path.stem)
-def test_every_recipe_runs_two_steps(recipe: Path, scenes: Path, tmp_path: Path) -> None:
-    result = train(recipe, **settings(scenes, tmp_path, epochs=2, max_steps=2, batch_size=2))
-    assert result.steps == 2
+def test_every_recipe_runs_a_step(recipe: Path, scenes: Path, tmp_path: Path) -> None:
+    assert train(recipe, **settings(scenes, tmp_path, epochs=1, max_steps=1, batch_size=2)).steps == 1
     assert recipe.read_text().startswith("# ")
     assert "Measured result" in recipe.read_text()
 
