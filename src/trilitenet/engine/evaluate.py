@@ -321,7 +321,7 @@ def _report(
         lambda images: Provenance(
             **fields,
             images=images,
-            versions=dict(describe_versions()),
+            versions=describe_versions(),
             hardware=describe_hardware(),
             started=datetime.datetime.fromtimestamp(started, datetime.timezone.utc).isoformat(timespec="seconds"),
             seconds=round(time.time() - started, 3),

@@ -6,7 +6,7 @@ import hashlib
 import importlib.metadata
 import platform
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
@@ -30,7 +30,7 @@ def hash_files(paths: Iterable[Path]) -> str:
     return digest.hexdigest()
 
 
-def describe_versions() -> Mapping[str, str]:
+def describe_versions() -> dict[str, str]:
     """Return versions by name; a runtime appears when it is loaded."""
     versions = {
         "trilitenet": trilitenet.__version__,

@@ -72,25 +72,18 @@ def initialise(network: nn.Module, source: nn.Module) -> TransferReport:
     return TransferReport(tuple(loaded), tuple(misshapen), tuple(missing), tuple(surplus))
 
 
-def freeze(network: nn.Module, parts: Sequence[str]) -> int:
+def freeze(network: nn.Module, parts: Sequence[str]) -> None:
     """Exclude parts from training.
 
     Args:
         network: The network.
         parts: Module names, for example ``"encoder"`` or ``"encoder.level1"``.
 
-    Returns:
-        The number of frozen parameters.
-
     Raises:
         ConfigError: If there is no such part.
     """
-    count = 0
     for part in parts:
-        for parameter in _part(network, part).parameters():
-            parameter.requires_grad_(False)
-            count += parameter.numel()
-    return count
+        _part(network, part).requires_grad_(False)
 
 
 def keep_frozen(network: nn.Module, parts: Sequence[str]) -> None:
