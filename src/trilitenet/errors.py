@@ -1,4 +1,4 @@
-"""Every exception the package raises on purpose.
+"""Every exception the package raises on purpose, and what raises most of them: messages, extras, files made whole.
 
     TriLiteNetError
     ├── ConfigError (ValueError)          an unknown key, option, variant, task or value out of range
@@ -12,7 +12,8 @@
     └── TrainingError (RuntimeError)      a training run that cannot go on
 
 Each also derives from the built-in a caller would expect. Messages are one line that names the cause and the cure;
-the command line prints them as they are and exits 1.
+the command line prints them as they are and exits 1. Files are written whole or not at all by `write_file`, `replacing`
+and `folder_beside`, optional packages imported by `import_extra`.
 """
 
 from __future__ import annotations
