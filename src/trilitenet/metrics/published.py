@@ -121,12 +121,11 @@ class PublishedSegmentation:
         Raises:
             ShapeError: If the masks are of different sizes.
         """
-        counted = prediction is not None and truth is not None
+        counts = None
         if prediction is not None and truth is not None:
-            self._counts.append(confusion(as_binary(prediction), as_binary(truth)))
-        else:
-            self._counts.append((0, 0, 0, 0))
-        self._labelled.append(counted)
+            counts = confusion(as_binary(prediction), as_binary(truth))
+        self._counts.append(counts or (0, 0, 0, 0))
+        self._labelled.append(counts is not None)
 
     def figures(self, weights: NDArray[Any] | None = None) -> dict[str, FloatArray]:
         """Return figures by name under R weightings of the images at once.
