@@ -58,6 +58,7 @@ class Interrupted:
     def __init__(self, source: BddSource, after: int) -> None:
         self._source = source
         self._left = after
+        self.found = source.found
         self.splits = source.splits
         self.origin = source.origin
 
@@ -191,6 +192,7 @@ def test_a_broken_image_is_left_out_and_counted(raw: Path, tmp_path: Path) -> No
 class Records:
     """Records that a test makes, as a source."""
 
+    found: ClassVar[tuple[str, ...]] = ()
     origin: ClassVar[dict[str, str]] = {"kind": "test"}
 
     def __init__(self, **splits: list[ImageRecord]) -> None:

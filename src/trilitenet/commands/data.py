@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -149,7 +149,7 @@ def convert(
         images=images,
     )
     with show_progress("reading the labels"):
-        records, found = _open_source(chosen, raw, mapping, options)
+        records = _open_source(chosen, raw, mapping, options)
     unknown = {item.rpartition("=")[0] for item in lane_width} - {"", "*", *records.splits}
     if unknown:
         raise ConfigError(f"--lane-width names no split {min(unknown)!r}; there are {', '.join(records.splits)}")
@@ -164,7 +164,7 @@ def convert(
             description=description,
             progress=advance,
         )
-    return Converted(out, found, report)
+    return Converted(out, records.found, report)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -428,18 +428,16 @@ def _arguments(source: str, output: StrPath, target: StrPath | None, kind: str |
     return kind, source, Path(output)
 
 
-def _open_source(
-    kind: str, raw: str, mapping: LabelMapping, options: ConversionOptions
-) -> tuple[RecordSource, tuple[str, ...]]:
+def _open_source(kind: str, raw: str, mapping: LabelMapping, options: ConversionOptions) -> RecordSource:
     if kind == "bdd100k":
-        bdd = read_bdd100k(raw, crosswalk=options.crosswalk, vertical=options.vertical)
-        return bdd, bdd.found
-    if kind == "yolo":
-        yolo = read_yolo(raw, mapping)
-        return yolo, yolo.found
-    readers = {"coco": read_coco, "cvat": read_cvat, "masks": read_masks}
-    listed = readers[kind](raw, mapping)
-    return listed, listed.found
+        return read_bdd100k(raw, crosswalk=options.crosswalk, vertical=options.vertical)
+    readers: dict[str, Callable[[str, LabelMapping], RecordSource]] = {
+        "coco": read_coco,
+        "yolo": read_yolo,
+        "cvat": read_cvat,
+        "masks": read_masks,
+    }
+    return readers[kind](raw, mapping)
 
 
 def _widths(items: Sequence[str]) -> dict[str, float]:

@@ -321,6 +321,10 @@ class RecordSource(Protocol):
     """A foreign data set: names first, each record when it is wanted, from any process (so it must be picklable)."""
 
     @property
+    def found(self) -> tuple[str, ...]:
+        """One line for each thing that was found, for the user."""
+
+    @property
     def origin(self) -> Mapping[str, str]:
         """What tells this source from another: its kind, its path, what its names mean. A conversion keeps to one."""
 
