@@ -101,7 +101,7 @@ def trainer(
 
 def fit(run: Trainer, *, resume: bool = False) -> tuple[TrainResult, Log]:
     told = Log()
-    return run.fit(run.folder / "last.ckpt" if resume else None, lambda _: [told]), told
+    return run.fit(run.folder / "last.ckpt" if resume else None, lambda _step, _validated: [told]), told
 
 
 def test_accumulated_batches_follow_each_other_over_a_stop(tmp_path: Path) -> None:
