@@ -84,7 +84,7 @@ $(RUNTIME): pyproject.toml $(PYTORCH)
 	@touch $@
 
 $(DEVELOP): pyproject.toml $(PYTORCH)
-	$(INSTALL) --editable ".[all,dev]"
+	$(INSTALL) --editable ".[all,executorch,dev]"
 	@$(COMPILE)
 	@touch $(RUNTIME) $@
 

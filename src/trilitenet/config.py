@@ -255,6 +255,7 @@ ARTEFACT_SUFFIXES: Final = {
     "onnx": ".onnx",
     "openvino": ".xml",
     "ncnn": ".ncnn.param",
+    "executorch": ".pte",
     "tensorrt": ".engine",
     "torch": ".pt2",
 }
@@ -266,7 +267,7 @@ class ArtefactInfo:
     """How an exported artefact takes pixels and returns results; what the network is stands in its card.
 
     Attributes:
-        format: ``"onnx"``, ``"openvino"``, ``"ncnn"``, ``"tensorrt"`` or ``"torch"``.
+        format: ``"onnx"``, ``"openvino"``, ``"ncnn"``, ``"executorch"``, ``"tensorrt"`` or ``"torch"``.
         precision: See `Precision`.
         size: (height, width) of the input in pixels; None if any multiples of 32 will do.
         input: ``"uint8_nhwc"``: (B, H, W, 3) uint8, or ``"float_nchw"``: (B, 3, H, W) float32 of 0 .. 255. B is 1.

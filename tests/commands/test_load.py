@@ -91,7 +91,13 @@ def test_masks_that_are_decided_inside_take_no_thresholds(artefacts: Artefacts) 
 
 @pytest.mark.parametrize(
     ("backend", "format"),
-    [("onnxruntime", "onnx"), ("openvino", "openvino"), ("ncnn", "ncnn"), ("tensorrt", "tensorrt")],
+    [
+        ("onnxruntime", "onnx"),
+        ("openvino", "openvino"),
+        ("ncnn", "ncnn"),
+        ("executorch", "executorch"),
+        ("tensorrt", "tensorrt"),
+    ],
 )
 def test_a_runtime_that_weights_do_not_run_on_tells_its_export(backend: str, format: str) -> None:
     with pytest.raises(ConfigError, match=f"trilitenet export tiny --format {format}$"):

@@ -141,7 +141,7 @@ def _converted(type_: Any, tokens: Sequence[cyclopts.Token]) -> Any:
 
 
 _LISTS: Final = {
-    "--backend": "auto|torch|onnxruntime|openvino|tensorrt|ncnn",
+    "--backend": "auto|torch|onnxruntime|openvino|ncnn|executorch|tensorrt",
     "--batch": r"\d+",
     "--by": r"(?!(tiny|small|base)$)[^-./\\][^./\\]*",
     "--card": r".+\.ya?ml",

@@ -31,6 +31,7 @@ from trilitenet.config import (
     check_size,
 )
 from trilitenet.data.reading import DrivingDataset, is_image_file
+from trilitenet.deploy.executorch import build_executorch
 from trilitenet.deploy.graph import DeployGraph, Traceable
 from trilitenet.deploy.layouts import pick_layout
 from trilitenet.deploy.ncnn import build_ncnn, save_ncnn
@@ -71,13 +72,14 @@ __all__ = [
     "find_pictures",
 ]
 
-Format = Literal["onnx", "openvino", "ncnn", "tensorrt", "torch", "triton"]
+Format = Literal["onnx", "openvino", "ncnn", "executorch", "tensorrt", "torch", "triton"]
 _Item = TypeVar("_Item")
 
 PRECISIONS: Final[dict[str, tuple[Precision, ...]]] = {
     "onnx": ("fp32", "fp16", "int8"),
     "openvino": ("fp32", "fp16", "bf16", "int8"),
     "ncnn": ("fp32", "fp16"),
+    "executorch": ("fp32",),
     "tensorrt": ("fp32", "fp16", "bf16"),
     "torch": ("fp32",),
     "triton": ("fp32", "fp16", "int8"),
@@ -85,6 +87,8 @@ PRECISIONS: Final[dict[str, tuple[Precision, ...]]] = {
 """Precisions of a format."""
 _RUNTIMES: Final = {"onnx": "onnxruntime"}
 """Runtimes that are not called as their format is."""
+_PORTABLE: Final = ("ncnn", "executorch", "tensorrt")
+"""Formats of the portable graph, of a fixed size."""
 DROP_FRAMES: Final = 150
 """The drop of INT8 is measured on at most so many images, spread evenly over the val split."""
 DROP_SCORES: Final[dict[Task, str]] = {
@@ -147,12 +151,12 @@ def export(
 
     Args:
         model: Name of shipped weights, or a file of weights.
-        format: onnx, openvino (.xml and .bin), ncnn (.ncnn.param, .bin and .json), tensorrt (.engine, or .onnx and the
-            trtexec line), torch (.pt2) or triton (a model repository with an ONNX graph in it).
+        format: onnx, openvino (.xml and .bin), ncnn (.ncnn.param, .bin and .json), executorch (.pte), tensorrt
+            (.engine, or .onnx and the trtexec line), torch (.pt2) or triton (a model repository with an ONNX graph).
         output: File to write (for triton, the folder of the repository); by default named after the model, here.
         precision: fp32, fp16 (weights stored so; on Arm, NCNN computes so too), bf16 (OpenVINO) or int8 (needs
             --calibration).
-        size: HEIGHTxWIDTH of the input in multiples of 32, or dynamic (neither ncnn nor tensorrt).
+        size: HEIGHTxWIDTH of the input in multiples of 32, or dynamic (not with ncnn, executorch or tensorrt).
         calibration: Frames for INT8: a data set in the published layout (its train split) or a folder of pictures.
         calibration_frames: At most so many of them.
         max_drop: INT8 may lose at most so many points of a score on the val split of --calibration; layers fall back
@@ -160,7 +164,7 @@ def export(
         nms: Put non-maximum suppression inside, with the model's thresholds (onnx, openvino, triton).
         portable: Avoid operators that compilers for phones and accelerators refuse; float input, float mask logits.
         masks: decision (0 or 1, by the model's thresholds; the default), probability (x 255) or logit (the only choice,
-            and the default, with --portable, ncnn and tensorrt).
+            and the default, with --portable, ncnn, executorch and tensorrt).
         mask_scale: 2 doubles the size of masks inside the graph.
         bgr: Take BGR pixels (`trilitenet.load` converts by itself).
         layout: auto, or a memory layout by name (docs/speed.md); all compute the same.
@@ -176,7 +180,7 @@ def export(
         BackendError: If the comparison fails.
     """
     model, output, calibration, frames = os.fspath(model), *map(optional_path, (output, calibration, frames))
-    portable = portable or format in ("ncnn", "tensorrt")
+    portable = portable or format in _PORTABLE
     parsed = _parse_size(size)
     _check_options(
         format, precision, parsed, calibration, calibration_frames, max_drop, nms, portable, masks, mask_scale, layout
@@ -242,6 +246,8 @@ def export(
         return _keep(network, program, info, path, checks)
     if format == "ncnn":
         return _keep(network, build_ncnn(graph, network.card, info), info, path, checks)
+    if format == "executorch":
+        return _keep(network, build_executorch(graph, network.card, info), info, path, checks)
     thresholds = network.card.thresholds if nms else None
     proto = build_onnx(graph, network.card, info, nms=thresholds, half=format == "onnx" and precision == "fp16")
     if format == "tensorrt":
@@ -284,15 +290,17 @@ def _check_options(
     if max_drop is not None and nms:
         raise ConfigError("--max-drop measures the boxes that --nms drops; find what to keep without --nms")
     if portable and layout not in ("auto", "planar"):
-        raise ConfigError(f"--portable is planar, as are ncnn and tensorrt; leave --layout {layout} out")
-    if size is None and (precision == "int8" or format in ("ncnn", "tensorrt")):
+        raise ConfigError(f"--portable is planar, as are {', '.join(_PORTABLE)}; leave --layout {layout} out")
+    if size is None and (precision == "int8" or format in _PORTABLE):
         raise ConfigError(f"{'int8' if precision == 'int8' else format} needs a fixed --size")
     if portable and masks not in (None, "logit"):
         raise ConfigError(
-            f"masks of ncnn, tensorrt and --portable are logits; give --masks logit or leave it out, not {masks}"
+            f"masks of --portable, {', '.join(_PORTABLE)} are logits; give --masks logit or leave it out, not {masks}"
         )
     if portable and mask_scale != 1:
-        raise ConfigError("--mask-scale doubles masks that are decided; ncnn, tensorrt and --portable give logits")
+        raise ConfigError(
+            f"--mask-scale doubles masks that are decided; --portable, {', '.join(_PORTABLE)} give logits"
+        )
 
 
 def check_drop(max_drop: float | None) -> None:
@@ -398,6 +406,8 @@ def _write(built: Any, path: Path, network: TriLiteNet, info: ArtefactInfo) -> N
         save_openvino(built, path, network.card, info)
     elif info.format == "ncnn":
         save_ncnn(built, path, network.card, info)
+    elif info.format == "executorch":
+        path.write_bytes(built)
     elif info.format == "torch":
         metadata = {CARD_KEY: network.card.to_json(), ARTEFACT_KEY: info.to_json()}
         data = io.BytesIO()  # PyTorch aborts the process where it cannot write to a file

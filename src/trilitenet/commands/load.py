@@ -16,17 +16,18 @@ from trilitenet.inference.predictor import Predictor
 
 __all__ = ["BACKENDS", "check_parallel", "load", "open_backend"]
 
-BACKENDS = ("auto", "torch", "onnxruntime", "openvino", "ncnn", "tensorrt")
+BACKENDS = ("auto", "torch", "onnxruntime", "openvino", "ncnn", "executorch", "tensorrt")
 """What ``backend`` may be."""
 _RUNS: Final[dict[str, tuple[str, ...]]] = {
     ".onnx": ("openvino", "onnxruntime"),
     ".xml": ("openvino",),
     ".param": ("ncnn",),
+    ".pte": ("executorch",),
     ".engine": ("tensorrt",),
 }
 """Runtimes of a file by its suffix; others run on PyTorch."""
-_MADE: Final = {"onnxruntime": "onnx", "openvino": "openvino", "ncnn": "ncnn", "tensorrt": "tensorrt"}
-"""What to export for a runtime."""
+_MADE: Final = {"onnxruntime": "onnx"}
+"""What to export for a runtime that is not called as its format is."""
 
 
 def load(
@@ -47,11 +48,11 @@ def load(
 
     Args:
         model: Name of shipped weights, a file of weights, or an exported artefact (.onnx, .xml, .param or the folder
-            it is in, .engine, .pt2).
+            it is in, .pte, .engine, .pt2).
         device: auto (the best there is), cpu, cuda, cuda:1, mps.
-        backend: auto (the fastest present that runs the file), torch, onnxruntime, openvino, ncnn or tensorrt. A
-            file of weights runs on PyTorch: on CUDA, auto is its deploy graph in fp16 under CUDA graphs, torch the
-            plain network in fp32.
+        backend: auto (the fastest present that runs the file), torch, onnxruntime, openvino, ncnn, executorch or
+            tensorrt. A file of weights runs on PyTorch: on CUDA, auto is its deploy graph in fp16 under CUDA graphs,
+            torch the plain network in fp32.
         confidence: Keep boxes whose confidence is above this, in [0, 1]; the model's own if left out.
         iou: A box goes when it overlaps a better one by more, in [0, 1]; the model's own if left out.
         drivable: A pixel is drivable above this probability, in [0, 1]; the model's own if left out.
@@ -60,7 +61,8 @@ def load(
             of an artefact is fixed to.
         batch_size: At most so many images go through the network at once.
         streams: Images that OpenVINO computes at once: more frames a second, more latency.
-        threads: Threads of the runtime; its own choice if left out. PyTorch has one number for the whole process.
+        threads: Threads of the runtime; its own choice if left out. PyTorch and ExecuTorch have one number for the
+            whole process.
 
     Returns:
         The predictor.
@@ -118,7 +120,7 @@ def open_backend(
             usable = ["onnxruntime"]
         backend = (usable or runs)[0]
     elif backend not in runs:
-        cure = f"; make a file for it with: trilitenet export {model} --format {_MADE.get(backend)}"
+        cure = f"; make a file for it with: trilitenet export {model} --format {_MADE.get(backend, backend)}"
         exported = suffix in _RUNS or suffix == ".pt2"
         raise ConfigError(f"{model} runs on {' or '.join(runs)}, not on {backend}{'' if exported else cure}")
     if backend == "openvino":
@@ -133,6 +135,10 @@ def open_backend(
         from trilitenet.inference.ncnn_backend import NcnnBackend
 
         return NcnnBackend(model, device, threads=threads)
+    if backend == "executorch":
+        from trilitenet.inference.executorch_backend import ExecuTorchBackend
+
+        return ExecuTorchBackend(model, device, threads=threads)
     if backend == "tensorrt":
         from trilitenet.inference.tensorrt_backend import TensorRTBackend
 

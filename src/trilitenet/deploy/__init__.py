@@ -1,1 +1,1 @@
-"""The deploy graph and its exports: ONNX, OpenVINO, NCNN, TensorRT, INT8, with a parity gate."""
+"""The deploy graph and its exports: ONNX, OpenVINO, NCNN, ExecuTorch, TensorRT, INT8, with a parity gate."""

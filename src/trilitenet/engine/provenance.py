@@ -18,7 +18,7 @@ from trilitenet.processing.cores import processor, usable_cores
 
 __all__ = ["describe_hardware", "describe_versions", "hash_files", "peak_memory"]
 
-_RUNTIMES: Final = ("torch", "onnxruntime", "openvino", "ncnn", "tensorrt")
+_RUNTIMES: Final = ("torch", "onnxruntime", "openvino", "ncnn", "executorch", "tensorrt")
 
 
 def hash_files(paths: Iterable[Path]) -> str:

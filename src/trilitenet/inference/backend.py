@@ -126,7 +126,7 @@ class ParallelSessions:
 
 @runtime_checkable
 class Backend(Protocol):
-    """A network on a runtime: PyTorch, ONNX Runtime, OpenVINO, NCNN, TensorRT, or a fake in tests.
+    """A network on a runtime: PyTorch, ONNX Runtime, OpenVINO, NCNN, ExecuTorch, TensorRT, or a fake in tests.
 
     Attributes:
         card: What the network is: classes, normalisation, thresholds.

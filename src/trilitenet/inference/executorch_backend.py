@@ -1,0 +1,105 @@
+"""Exported ``.pte`` artefacts on ExecuTorch, whose Python interface takes tensors of PyTorch."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import sys
+import threading
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY
+from trilitenet.errors import BackendError, WeightsError, import_extra
+from trilitenet.inference.backend import check_process
+from trilitenet.inference.exported import ArtefactBackend, prepare_input, read_metadata
+
+__all__ = ["ExecuTorchBackend"]
+
+
+class ExecuTorchBackend(ArtefactBackend):
+    """An artefact of ``trilitenet export --format executorch`` on ExecuTorch, on the CPU.
+
+    Args:
+        path: The ``.pte`` file.
+        device: ``"auto"`` or ``"cpu"``.
+        threads: Threads, one number for the whole process; ExecuTorch's own choice if left out.
+
+    Raises:
+        MissingExtraError: If ExecuTorch is not installed.
+        WeightsError: If the file is missing, broken or foreign, or of a newer layout.
+        BackendError: If the device is not there.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], device: str = "auto", *, threads: int | None = None) -> None:
+        if device not in ("auto", "cpu"):
+            raise BackendError(f"device {device!r}: ExecuTorch runs on the CPU here; use auto or cpu")
+        self._path, self._threads = Path(path), threads
+        if not self._path.is_file():
+            raise WeightsError(f"{self._path}: no such file")
+        with _unsaid():
+            # Not executorch.runtime, which is the same behind 6 seconds of imports for exporting.
+            runtime = import_extra("executorch.extension.pybindings._portable_lib", "executorch")
+            if threads is not None:
+                runtime._unsafe_reset_threadpool(threads)
+            data = self._path.read_bytes()
+            try:
+                program = runtime._load_program_from_buffer(
+                    data, program_verification=runtime.Verification.InternalConsistency
+                )
+                methods = {program.get_method_name(index) for index in range(program.num_methods())}
+                found = {key: program.load_method(key)([])[0] for key in (CARD_KEY, ARTEFACT_KEY) if key in methods}
+                self._card, self.info = read_metadata(found, str(self._path))
+                # Kept together, for each borrows memory of the one before without keeping it alive.
+                self._session: Any = data, program, program.load_method("forward")
+            except (RuntimeError, UnicodeError) as error:
+                raise WeightsError(
+                    f"{self._path}: not a usable ExecuTorch program (damaged, or another file)"
+                ) from error
+        self._process = os.getpid()
+        self._lock = threading.Lock()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle it as what opens it again: its file, which must be there, and its options."""
+        return functools.partial(ExecuTorchBackend, self._path.absolute(), threads=self._threads), ()
+
+    @property
+    def name(self) -> str:
+        """The runtime and the device."""
+        return "executorch cpu"
+
+    def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
+        if self._session is None:
+            raise BackendError(f"{self._path}: the model was closed")
+        check_process(self._process)
+        return [self._run(image) for image in batch]
+
+    def _run(self, image: NDArray[np.uint8]) -> Mapping[str, NDArray[Any]]:
+        planes = torch.from_numpy(prepare_input(image, self.info))
+        with self._lock:  # a method has one set of buffers
+            outputs = self._session[-1]([planes])
+        return {task: output.numpy() for task, output in zip(self._card.tasks, outputs, strict=True)}
+
+    def close(self) -> None:
+        """Free the program."""
+        self._session = None
+
+
+@contextlib.contextmanager
+def _unsaid() -> Iterator[None]:
+    """Inside, nothing reaches standard error: ExecuTorch logs there what it looks up, and what is raised as well."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with Path(os.devnull).open("w", encoding="utf-8") as sink:
+            os.dup2(sink.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)

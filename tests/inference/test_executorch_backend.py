@@ -1,0 +1,143 @@
+"""ExecuTorch on exported artefacts: parity, one file that tells all, refusals, and silence."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from filelock import FileLock
+
+import trilitenet
+from tests.artefacts import SIZE, Artefacts
+from tests.deploy.networks import lively_network
+from tests.deploy.test_graph import by_cell
+from trilitenet.commands.export import export
+from trilitenet.config import ArtefactInfo
+from trilitenet.deploy.executorch import build_executorch
+from trilitenet.deploy.graph import DeployGraph
+from trilitenet.deploy.layouts import LAYOUTS
+from trilitenet.errors import BackendError, ConfigError, MissingExtraError, ShapeError, WeightsError
+from trilitenet.inference.backend import Backend
+from trilitenet.inference.executorch_backend import ExecuTorchBackend
+from trilitenet.inference.torch_backend import TorchBackend
+from trilitenet.models.weights import load_network, save_network
+
+pytest.importorskip("executorch")
+
+
+@pytest.fixture(scope="session")
+def program(artefacts: Artefacts) -> Path:
+    """Lowering takes long: once for all processes."""
+    path = artefacts.folder / "model.pte"
+    with FileLock(path.with_suffix(".lock")):
+        if not path.exists():
+            network = load_network(artefacts.folder / "weights.safetensors").eval()
+            info = ArtefactInfo("executorch", size=SIZE, input="float_nchw", masks="logit", trilitenet="0")
+            graph = DeployGraph(network, LAYOUTS["planar"], masks="logit")
+            path.write_bytes(build_executorch(graph, network.card, info))
+    return path
+
+
+def test_equals_the_network(artefacts: Artefacts, program: Path) -> None:
+    network = load_network(artefacts.folder / "weights.safetensors")
+    wanted = TorchBackend(network, "cpu").run(artefacts.images)
+    backend = ExecuTorchBackend(program)
+    assert isinstance(backend, Backend)
+    assert backend.card == network.card
+    assert backend.canvas == SIZE
+    assert backend.name == "executorch cpu"
+    got = backend.run(artefacts.images)
+    assert wanted.detection is not None
+    assert got.detection is not None
+    reordered = by_cell(torch.from_numpy(wanted.detection), *SIZE).numpy()
+    assert np.abs(got.detection - reordered).max() < 0.01
+    for task, threshold in (("drivable", 0.5), ("lane", 0.49)):
+        mask = getattr(got, task)
+        assert mask.shape == (2, *SIZE)
+        assert set(np.unique(mask)) <= {0, 255}
+        assert np.mean((mask > 0) == (getattr(wanted, task) > int(threshold * 255))) > 0.9999
+    backend.close()
+    backend.close()
+    with pytest.raises(BackendError, match="closed"):
+        backend.run(artefacts.images)
+
+
+def test_load_finds_it_and_another_process_may_have_it(program: Path) -> None:
+    predictor = trilitenet.load(program, threads=1)
+    assert predictor.backend.name == "executorch cpu"
+    copy = pickle.loads(pickle.dumps(predictor))  # noqa: S301 - its own
+    frame = np.random.default_rng(1).integers(0, 256, (90, 160, 3), np.uint8)
+    np.testing.assert_array_equal(copy(frame).lane, predictor(frame).lane)
+    with pytest.raises(ConfigError, match="runs on executorch, not on openvino"):
+        trilitenet.load(program, backend="openvino")
+
+
+def test_a_fork_is_told_to_load_it_itself(program: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    backend = ExecuTorchBackend(program)
+    process = os.getpid()
+    monkeypatch.setattr(os, "getpid", lambda: process + 1)
+    with pytest.raises(BackendError, match="before this process was forked"):
+        backend.run(np.zeros((1, *SIZE, 3), np.uint8))
+
+
+def test_refusals(program: Path, tmp_path: Path) -> None:
+    with pytest.raises(ShapeError, match="128x64"):
+        ExecuTorchBackend(program).run(np.zeros((1, 96, 128, 3), np.uint8))
+    with pytest.raises(BackendError, match="runs on the CPU"):
+        ExecuTorchBackend(program, "cuda")
+    with pytest.raises(WeightsError, match="no such file"):
+        ExecuTorchBackend(tmp_path / "no.pte")
+
+
+@pytest.mark.parametrize("keep", [0, 10, 1000, 0.5, -100])
+def test_a_file_that_is_cut_short_is_one_line(program: Path, tmp_path: Path, keep: float) -> None:
+    content = program.read_bytes()
+    broken = tmp_path / "broken.pte"
+    broken.write_bytes(content[: int(keep * len(content)) if 0 < keep < 1 else int(keep)])
+    with pytest.raises(WeightsError, match=r"broken\.pte: not a usable ExecuTorch program") as caught:
+        ExecuTorchBackend(broken)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_damaged_card_is_one_line(program: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged.pte"
+    damaged.write_bytes(program.read_bytes().replace(b'"licence": "MIT"', b'"licence": "\xff\xff\xff"', 1))
+    with pytest.raises(WeightsError, match="not a usable ExecuTorch program"):
+        ExecuTorchBackend(damaged)
+
+
+def test_it_loads_in_silence(program: Path, tmp_path: Path) -> None:
+    shutil.copy(program, tmp_path / "a.pte")
+    code = "import sys, trilitenet; trilitenet.load(sys.argv[1]); print('said', file=sys.stderr)"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "a.pte"], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=240
+    )
+    assert (done.stdout, done.stderr) == ("", "said\n")
+
+
+def test_the_extra_is_named(program: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "executorch.extension.pybindings._portable_lib", None)
+    with pytest.raises(MissingExtraError, match=r"trilitenet\[executorch\]"):
+        ExecuTorchBackend(program)
+
+
+def test_export_of_one_task(tmp_path: Path) -> None:
+    network = lively_network(tasks=("lane",))
+    save_network(network, tmp_path / "weights.safetensors", network.card)
+    path = tmp_path / "made" / "a.pte"
+    done = export(tmp_path / "weights.safetensors", format="executorch", bgr=True, size="64x96", output=path)
+    assert done.parity is not None
+    assert done.parity.failures == []
+    assert [file.name for file in path.parent.iterdir()] == ["a.pte"]
+    with trilitenet.load(path) as predictor:
+        assert predictor.backend.card.tasks == ("lane",)
+        perception = predictor(np.zeros((90, 160, 3), np.uint8))
+        assert perception.lane is not None
+        assert perception.drivable is None
