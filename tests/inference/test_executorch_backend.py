@@ -7,6 +7,7 @@ import pickle
 import shutil
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ from trilitenet.deploy.graph import DeployGraph
 from trilitenet.deploy.layouts import LAYOUTS
 from trilitenet.errors import BackendError, ConfigError, MissingExtraError, ShapeError, WeightsError
 from trilitenet.inference.backend import Backend
-from trilitenet.inference.executorch_backend import ExecuTorchBackend
+from trilitenet.inference.executorch_backend import ExecuTorchBackend, _unsaid
 from trilitenet.inference.torch_backend import TorchBackend
 from trilitenet.models.weights import load_network, save_network
 
@@ -65,7 +66,7 @@ def test_equals_the_network(artefacts: Artefacts, program: Path) -> None:
         assert np.mean((mask > 0) == (getattr(wanted, task) > int(threshold * 255))) > 0.9999
     backend.close()
     backend.close()
-    with pytest.raises(BackendError, match="closed"):
+    with pytest.raises(BackendError, match=r"model\.pte: the model was closed; load it again"):
         backend.run(artefacts.images)
 
 
@@ -120,6 +121,24 @@ def test_it_loads_in_silence(program: Path, tmp_path: Path) -> None:
         [sys.executable, "-c", code, "a.pte"], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=240
     )
     assert (done.stdout, done.stderr) == ("", "said\n")
+
+
+def test_standard_error_is_there_after_programs_that_threads_load_at_once() -> None:
+    before = os.fstat(2)
+    entered, leave = threading.Event(), threading.Event()
+
+    def load() -> None:
+        with _unsaid():
+            entered.set()
+            leave.wait()
+
+    other = threading.Thread(target=load)
+    with _unsaid():
+        other.start()
+        entered.wait(0.2)
+    leave.set()
+    other.join()
+    assert os.path.samestat(before, os.fstat(2))
 
 
 def test_the_extra_is_named(program: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -17,10 +17,13 @@ from numpy.typing import NDArray
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY
 from trilitenet.errors import BackendError, WeightsError, import_extra
-from trilitenet.inference.backend import check_process
+from trilitenet.inference.backend import check_process, held
 from trilitenet.inference.exported import ArtefactBackend, prepare_input, read_metadata
 
 __all__ = ["ExecuTorchBackend"]
+
+_SILENCE: Final = threading.Lock()
+"""Standard error is one for all threads: two that turn it off and on at once would leave it off."""
 
 
 class ExecuTorchBackend(ArtefactBackend):
@@ -75,15 +78,14 @@ class ExecuTorchBackend(ArtefactBackend):
         return "executorch cpu"
 
     def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
-        if self._session is None:
-            raise BackendError(f"{self._path}: the model was closed")
+        session = held(self._session, self._path)
         check_process(self._process)
-        return [self._run(image) for image in batch]
+        return [self._run(session, image) for image in batch]
 
-    def _run(self, image: NDArray[np.uint8]) -> Mapping[str, NDArray[Any]]:
+    def _run(self, session: Any, image: NDArray[np.uint8]) -> Mapping[str, NDArray[Any]]:
         planes = torch.from_numpy(prepare_input(image, self.info))
         with self._lock:  # a method has one set of buffers
-            outputs = self._session[-1]([planes])
+            outputs = session[-1]([planes])
         return {task: output.numpy() for task, output in zip(self._card.tasks, outputs, strict=True)}
 
     def close(self) -> None:
@@ -94,12 +96,13 @@ class ExecuTorchBackend(ArtefactBackend):
 @contextlib.contextmanager
 def _unsaid() -> Iterator[None]:
     """Inside, nothing reaches standard error: ExecuTorch logs there what it looks up, and what is raised as well."""
-    sys.stderr.flush()
-    kept = os.dup(2)
-    try:
-        with Path(os.devnull).open("w", encoding="utf-8") as sink:
-            os.dup2(sink.fileno(), 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+    with _SILENCE:
+        sys.stderr.flush()
+        kept = os.dup(2)
+        try:
+            with Path(os.devnull).open("w", encoding="utf-8") as sink:
+                os.dup2(sink.fileno(), 2)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
