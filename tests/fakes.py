@@ -73,7 +73,7 @@ def coloured_scene(height: int = 360, width: int = 640) -> NDArray[np.uint8]:
 def written_by_another_process(path: Path) -> Iterator[None]:
     """Inside, another process has claimed a file and begun to write it; then it is killed."""
     program = (
-        "import fcntl, sys; file = open(sys.argv[1], 'w'); fcntl.lockf(file, fcntl.LOCK_EX); "
+        "import fcntl, sys; file = open(sys.argv[1], 'w'); fcntl.flock(file, fcntl.LOCK_EX); "
         "print('half', file=file, flush=True); print('claimed', flush=True); sys.stdin.read()"
     )
     command = [sys.executable, "-c", program, str(part_of(path))]

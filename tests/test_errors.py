@@ -93,6 +93,21 @@ def test_a_claim_goes_with_what_has_no_name_yet(tmp_path: Path) -> None:
     Claim(tmp_path / "nowhere" / "a.txt").close()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="files are not locked there")
+def test_a_claim_holds_within_the_process_and_when_others_close_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    claim = Claim(path)
+    part_of(path).write_text("half")  # closes the file
+    with pytest.raises(OutputError, match=r"a\.txt: it is being written already; wait for its end"):
+        Claim(path)
+    script = "import sys, pathlib, trilitenet.errors as e; e.Claim(pathlib.Path(sys.argv[1]))"
+    other = subprocess.run([sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=False)
+    assert "it is being written already" in other.stderr
+    assert part_of(path).read_text() == "half"
+    claim.close()
+    Claim(path).close()
+
+
 def test_who_may_read_a_file_is_as_before_and_as_the_process_makes_files(tmp_path: Path) -> None:
     old = tmp_path / "old"
     old.touch()

@@ -235,7 +235,7 @@ def part_of(path: Path) -> Path:
 
 
 class Claim:
-    """Keeps other processes from writing a file, while it is written as `part_of` names it.
+    """Keeps others, in this process and elsewhere, from writing a file, while it is written as `part_of` names it.
 
     Where the system or the file system knows no locks, it keeps off nobody.
 
@@ -243,7 +243,7 @@ class Claim:
         path: The file; its folder exists.
 
     Raises:
-        OutputError: If another process writes it.
+        OutputError: If somebody else writes it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -251,16 +251,17 @@ class Claim:
         while fcntl is not None and number is None:
             try:
                 number = os.open(part, os.O_RDWR | os.O_CREAT, 0o666)
-                fcntl.lockf(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # Not lockf, which lets go where any other file object of the process for it is closed.
+                fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
                 if number is not None:
                     os.close(number)
                     number = None
-                    if isinstance(error, (BlockingIOError, PermissionError)):
-                        reason = "another process is writing it; wait for its end, or choose another --output"
+                    if isinstance(error, BlockingIOError):
+                        reason = "it is being written already; wait for its end, or choose another --output"
                         raise OutputError(f"{path}: {reason}") from None
                 break  # what is wrong with its place is told by whoever writes it
-            if not _is_named(number, part):  # the other process has just given it its name
+            if not _is_named(number, part):  # the other has just given it its name
                 os.close(number)
                 number = None
         self._let_go = weakref.finalize(self, _let_go, number, part)

@@ -326,7 +326,7 @@ def test_a_video_that_another_process_writes_is_left_to_it(tmp_path: Path) -> No
     with written_by_another_process(tmp_path / "a.mp4"):
         writer = VideoWriter(tmp_path / "a.mp4")
         writer.write(coloured_scene(32, 32))
-        with pytest.raises(OutputError, match=r"a\.mp4: another process is writing it; wait for its end"):
+        with pytest.raises(OutputError, match=r"a\.mp4: it is being written already; wait for its end"):
             writer.close()
         assert (tmp_path / "a.mp4.part").read_text() == "half\n"
     with VideoWriter(tmp_path / "a.mp4") as writer:

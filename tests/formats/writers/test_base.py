@@ -71,7 +71,7 @@ def test_a_file_that_another_process_writes_is_left_to_it(
                 writer.write(dataclasses.replace(perception, source="a.mp4"))
 
     with written_by_another_process(tmp_path / file):
-        with pytest.raises(OutputError, match=rf"{file}: another process is writing it; wait for its end"):
+        with pytest.raises(OutputError, match=rf"{file}: it is being written already; wait for its end"):
             write()
         assert part_of(tmp_path / file).read_text() == "half\n"
         gc.collect()

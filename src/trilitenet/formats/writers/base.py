@@ -145,8 +145,8 @@ class Writer(abc.ABC):
         """Return the path of a file to write, in a folder that exists.
 
         Raises:
-            OutputError: If it exists and ``overwrite`` was not asked for, or another process is writing it, or the
-                folder cannot be made.
+            OutputError: If it exists and ``overwrite`` was not asked for, or it is being written already, or the folder
+                cannot be made.
         """
         path = self.output / name
         if path.exists() and not self.overwrite:
