@@ -173,6 +173,7 @@ def test_check_says_what_is_wrong(
     published: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("imagehash")
+    monkeypatch.setenv("COLUMNS", "200")
     html, document = tmp_path / "report.html", tmp_path / "report.json"
     words = ["data", "check", str(published), "--html", str(html), "--json", str(document), "--workers", "1"]
     assert main(words) == 0
