@@ -97,8 +97,8 @@ _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 """Characters that end a line or control a terminal."""
 _ROOT_OPTIONS: Final = ("--help", "-h", "--version")
 _SPINS: Final = "10000"
-"""Turns for which a thread of PyTorch's waits for others at full load, by default 300,000, while they wait for its core
-where there is other work; fewer make a training, which has the cores to itself, 7% slower."""
+"""Turns for which a thread of PyTorch's spins while it waits for another, by default 300,000. Where other processes
+want the cores, the other waits for its own meanwhile; a training, which has them to itself, is 7% slower with fewer."""
 
 
 def build_app(words: Sequence[str] = ()) -> cyclopts.App:
