@@ -190,6 +190,11 @@ def test_annotations_that_are_all_of_no_category_are_refused(tmp_path: Path) -> 
     write(tmp_path / "labels.json", coco(annotations=annotations))
     with pytest.raises(DataError, match=r"id of a category \(category_id '1', but categories 1, 2, 3\); write both"):
         read_coco(tmp_path)
+    others = [{**item, "category_id": 0} for item in annotations]  # as of a list of names
+    write(tmp_path / "other.json", coco(annotations=others))
+    with pytest.raises(DataError, match=r"\(category_id 0, but categories 1, 2, 3\); number both alike"):
+        read_coco(tmp_path / "other.json")
+    (tmp_path / "other.json").unlink()
     write(tmp_path / "labels.json", coco(annotations=[*annotations, coco()["annotations"][0]]))
     assert len(read_coco(tmp_path).record("train", "one").objects or ()) == 6  # of which all but one are told
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -121,17 +122,15 @@ def _read_file(
         stray = labels.keys() - known
         strays = sum(len(labels[number]) for number in stray)
         if content["images"] and stray and stray == labels.keys():
-            alike = set(map(str, stray)) & set(map(str, known))
-            cure = "write both alike, as numbers or as text" if alike else "they are of other images"
             raise DataError(
                 f"{path}: no annotation has the id of an image (image_id {min(map(repr, stray))}, but images "
-                f"{content['images'][0]['id']!r}, ...); {cure}"
+                f"{content['images'][0]['id']!r}, ...); {_cure(stray, known, 'they are of other images')}"
             )
         told = {item.get("category_id") for item in content["annotations"]}
         if names and told and told.isdisjoint(names):
             raise DataError(
                 f"{path}: no annotation has the id of a category (category_id {min(map(repr, told))}, but categories "
-                f"{few([repr(name) for name in names])}); write both alike, as numbers or as text"
+                f"{few([repr(name) for name in names])}); {_cure(told, names, 'number both alike')}"
             )
         tasks = mapping.labelled(set(names.values()))
         categories.update(names.values())
@@ -163,6 +162,12 @@ def _read_file(
     except (LookupError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise DataError(f"{path}: not as COCO has it ({brief(error)})") from error
     return records, missing, strays
+
+
+def _cure(given: Iterable[Any], known: Iterable[Any], otherwise: str) -> str:
+    """Return what to do about ids of which none is known."""
+    alike = not set(map(str, given)).isdisjoint(map(str, known))
+    return "write both alike, as numbers or as text" if alike else otherwise
 
 
 def _read_labels(items: list[dict[str, Any]], names: dict[Any, str], mapping: LabelMapping) -> Labels:
