@@ -15,6 +15,9 @@ TORCH ?= torch==2.13.0
 JOBS ?= 2
 PYTEST_ARGS ?=
 DEMO ?= demo-output
+# ExecuTorch is built for this version of PyTorch, which pip would install in place of another; without it its tests are skipped.
+comma := ,
+EXTRAS := all$(if $(findstring 2.13,$(TORCH)),$(comma)executorch)
 
 INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile
 # On all cores, where pip compiles on one; some packages hold files for other versions of Python. Their tests stay.
@@ -84,7 +87,7 @@ $(RUNTIME): pyproject.toml $(PYTORCH)
 	@touch $@
 
 $(DEVELOP): pyproject.toml $(PYTORCH)
-	$(INSTALL) --editable ".[all,executorch,dev]"
+	$(INSTALL) --editable ".[$(EXTRAS),dev]"
 	@$(COMPILE)
 	@touch $(RUNTIME) $@
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import shlex
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +54,15 @@ def test_make_targets_exist(line: str) -> None:
     targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     asked = {word for word in line.split()[1:] if "=" not in word and not word.startswith(("-", "apt", "<"))}
     assert asked <= targets
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+@pytest.mark.parametrize(("words", "extras"), [([], "all,executorch,dev"), (["TORCH=torch==2.6.0"], "all,dev")])
+def test_another_pytorch_is_not_replaced_for_executorch(words: list[str], extras: str, tmp_path: Path) -> None:
+    command = ["make", "--dry-run", "test", f"VENV={tmp_path}", *words]
+    alone = {"PATH": os.environ["PATH"]}  # without what a make that runs the tests was told
+    done = subprocess.run(command, cwd=ROOT, env=alone, capture_output=True, text=True, check=True)
+    assert f'install --quiet --no-compile --editable ".[{extras}]"' in done.stdout
 
 
 @pytest.mark.parametrize("line", commands_of("pip"))
