@@ -396,7 +396,7 @@ def _convert_one(record: ImageRecord, split: str, root: Path, options: Conversio
     if record.drivable is not None:
         if isinstance(record.drivable, MaskFile):
             mask, told = _mask_of(record.drivable, size, keep_alternative=options.keep_alternative)
-            dropped["drivable: mask with values that nothing explains"] += told
+            dropped["drivable: values of a mask that nothing explains"] += told
         else:
             mask = drivable_mask(record.drivable, size, keep_alternative=options.keep_alternative)
             dropped["area with too few points"] += sum(
@@ -407,7 +407,7 @@ def _convert_one(record: ImageRecord, split: str, root: Path, options: Conversio
     if record.lane is not None:
         if isinstance(record.lane, MaskFile):
             mask, told = _mask_of(record.lane, size, keep_alternative=False)
-            dropped["lane: mask with values that nothing explains"] += told
+            dropped["lane: values of a mask that nothing explains"] += told
             summary["lanes"] = {"masks": 1}
         else:
             mask, drawn, left_out = lane_mask(record.lane, size, options.width(split), options)

@@ -98,7 +98,7 @@ def test_values_that_the_masks_of_bdd100k_do_not_have_are_told(tmp_path: Path, k
         mask[0] = value
         cv2.imwrite(str(path), mask)
         report = convert(read_bdd100k(tmp_path), tmp_path / "out")
-        assert report.dropped["train"].get("drivable: mask with values that nothing explains", 0) == count
+        assert report.dropped["train"].get("drivable: values of a mask that nothing explains", 0) == count
 
 
 def test_several_entries_of_one_image_are_told(tmp_path: Path) -> None:

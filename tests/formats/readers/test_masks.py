@@ -90,7 +90,7 @@ def test_values_that_nothing_explains_are_told(
     cv2.imwrite(str(root / "markings/train/b.png"), np.zeros(SIZE, np.uint8))
     report = convert(read_masks(root, mapping), tmp_path / "out")
     assert report.labelled["train"] == {"lane": 2}
-    assert report.dropped["train"].get("lane: mask with values that nothing explains", 0) == count
+    assert report.dropped["train"].get("lane: values of a mask that nothing explains", 0) == count
 
 
 def test_default_is_everything_above_zero(tmp_path: Path) -> None:
