@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import inspect
 import io
 import os
@@ -433,6 +434,19 @@ def test_standard_streams_that_are_closed_or_full_are_no_tracebacks(
     assert done.returncode == code
     assert "Traceback" not in done.stderr
     assert told is None or done.stderr.endswith(told)
+
+
+@pytest.mark.parametrize("command", ["import", "finish", "info"])
+def test_what_commands_write_by_themselves_on_a_full_disk_is_told(
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def write(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(cli, "build_app", lambda words: write)
+    monkeypatch.setattr(cli, "_discard_output", lambda: None)
+    assert cli.main(["weights", command]) == 1
+    assert capsys.readouterr().err == "error: standard output: cannot be written (No space left on device)\n"
 
 
 def test_an_interruption_before_the_command_line_is_there_is_no_traceback(tmp_path: Path) -> None:

@@ -217,12 +217,11 @@ def main(words: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader, such as `head`, has gone
         _discard_output()
     except OSError as error:
-        printed = not words or set(_ROOT_OPTIONS) & set(words)
-        if printed or (words[:2] == ["weights", "info"] and error.filename is None):  # what writes by itself
-            return _fail(_output_failed(error), code=1)
-        if error.filename is None:
+        if error.filename is not None:
+            return _fail(f"{error.filename}: {error.strerror}", code=1)  # such as a name that is too long
+        if words and words[0] != "weights" and not set(_ROOT_OPTIONS) & set(words):
             raise
-        return _fail(f"{error.filename}: {error.strerror}", code=1)  # such as a name that is too long
+        return _fail(_output_failed(error), code=1)  # of what writes by itself
     return int(getattr(result, "exit_code", 0))
 
 
