@@ -31,6 +31,7 @@ from trilitenet.inference.torch_backend import TorchBackend
 from trilitenet.models.weights import load_network, save_network
 
 pytest.importorskip("executorch")
+pytestmark = pytest.mark.slow  # whichever comes first waits for a program
 
 
 @pytest.fixture(scope="session")
