@@ -517,8 +517,10 @@ def test_a_clip_plays_at_its_speed_however_often_it_is_paused(page: Page, clip: 
     page["play"].click()
     assert page["play"].text == "Pause"
     page["save-clip"].click()
-    assert page["play"].text == "Play"  # else it would change what is recorded
+    assert page["play"].text == "Play"
+    assert not any(page[name].is_enabled() for name in ("play", "seek"))  # which would change what is recorded
     page.downloaded("drive.webm")
+    page.wait(lambda: page["play"].is_enabled() and page["seek"].is_enabled())
 
 
 def test_frames_for_which_there_was_no_time_are_asked_for_again(

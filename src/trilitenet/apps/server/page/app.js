@@ -292,8 +292,9 @@ function saveJson() {
 async function saveClip() {
   stopPlaying();
   const button = element("save-clip");
-  button.disabled = true;
   const recorder = new MediaRecorder(view.captureStream());
+  const controls = [button, element("play"), element("seek")]; // which would change what is recorded
+  for (const control of controls) control.disabled = true;
   const pieces = [];
   recorder.ondataavailable = (event) => pieces.push(event.data);
   const stopped = new Promise((resolve) => {
@@ -310,7 +311,7 @@ async function saveClip() {
   await stopped;
   save(new Blob(pieces, { type: "video/webm" }), ".webm");
   button.textContent = "Save clip";
-  button.disabled = false;
+  for (const control of controls) control.disabled = false;
 }
 
 // ---------------------------------------------------------------------------------------------- wiring
