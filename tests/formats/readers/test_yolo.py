@@ -87,6 +87,10 @@ def test_key_points_are_no_polygon(root: Path) -> None:
     (root / "labels/train/a.txt").write_text("0 0.5 0.5 0.5 0.5 0.1 0.1 0.2 0.2\n")
     (item,) = read_yolo(root).record("train", "a").objects or ()
     assert item.box == pytest.approx((20, 12, 60, 36))
+    text = (root / "data.yaml").read_text()
+    (root / "data.yaml").write_text(text.replace("[2, 2]", "null"))
+    (item,) = read_yolo(root).record("train", "a").objects or ()
+    assert item.box == pytest.approx((8, 4.8, 40, 24))  # of four corners
 
 
 def test_errors(tmp_path: Path) -> None:

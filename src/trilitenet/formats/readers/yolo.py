@@ -169,7 +169,7 @@ def read_yolo(root: str | Path, mapping: LabelMapping | None = None) -> YoloSour
     } - labels.keys()
     if stray:
         found.append(f"{len(stray)} label files are of no image in a split, such as {min(stray)}")
-    return YoloSource(path, dict(images), table, mapping, tuple(found), key_points="kpt_shape" in content)
+    return YoloSource(path, dict(images), table, mapping, tuple(found), key_points=bool(content.get("kpt_shape")))
 
 
 def _find_yaml(root: Path) -> Path:
