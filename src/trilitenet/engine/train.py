@@ -356,6 +356,8 @@ class Trainer:
             rate = self.schedule.apply(self.optimiser, self.step)
             sums += self._train_step(group)
             self.step += 1
+            if self.validate is None:
+                self.metrics = {}  # of a run that went on: they are those of other weights
             since += sum(len(batch) for batch in group) * self.fabric.world_size
             if self.step % self.config.log_every == 0:
                 self._log_losses(epoch, sums, rate, mark, since)
@@ -619,8 +621,7 @@ class Trainer:
         if state["scaler"]:
             self.fabric._precision.load_state_dict(state["scaler"])
         self.step, self.stale, self.ended = state["step"], state["stale"], state["ended"]
-        self.best = dict(state["best"])
-        self.metrics = {} if self.validate is None else dict(state["metrics"])  # else those of other weights at the end
+        self.best, self.metrics = dict(state["best"]), dict(state["metrics"])
         set_random_state(state["random"])
 
     def _read_best(self) -> None:
