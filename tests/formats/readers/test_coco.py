@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -296,6 +297,10 @@ def test_paths_may_be_of_windows(tmp_path: Path) -> None:
     write(tmp_path / "JPEGImages/one.png")
     write(tmp_path / "labels.json", coco(images=[{**coco()["images"][0], "file_name": r"JPEGImages\one.png"}]))
     assert read_coco(tmp_path).record("train", "one").image == tmp_path / "JPEGImages/one.png"
+    if sys.platform != "win32":  # where an archive of Windows was unpacked
+        (tmp_path / "JPEGImages/one.png").rename(tmp_path / r"JPEGImages\one.png")
+        (source,) = read_coco(tmp_path).names("train")
+        assert source == r"JPEGImages\one"
 
 
 def test_hidden_files_are_passed_over(tmp_path: Path) -> None:

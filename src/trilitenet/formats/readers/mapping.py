@@ -260,11 +260,11 @@ def find_image(name: str, folders: list[Path]) -> Path | None:
 
     A name without the ending of an image, as CVAT gives the frames of a video, is that of a file with any of them.
     """
-    name = name.replace("\\", "/")  # as written on Windows
+    posix = name.replace("\\", "/")  # as written on Windows, whose archives may have made files of such names here
     endings = [""]
     if Path(name).suffix.lower() not in IMAGE_ENDINGS:
         endings += [*IMAGE_ENDINGS, *map(str.upper, IMAGE_ENDINGS)]
-    for candidate in (name, Path(name).name):
+    for candidate in dict.fromkeys((name, posix, Path(posix).name)):
         for folder, ending in itertools.product(folders, endings):
             path = folder / f"{candidate}{ending}"
             with contextlib.suppress(OSError):  # a name that is too long is none of a file
