@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from filelock import FileLock
 from numpy.typing import NDArray
 
 from trilitenet.config import ArtefactInfo, Thresholds
+from trilitenet.errors import BackendError
+from trilitenet.inference.backend import Backend
 
 SIZE = (64, 128)
 
@@ -38,6 +41,42 @@ def shared_artefacts(folder: Path) -> Artefacts:
             _make_artefacts(part)
             part.rename(folder)
     return Artefacts(folder, np.random.default_rng(0).integers(0, 256, (2, *SIZE, 3), np.uint8))
+
+
+def check_backend(backend: Any, artefacts: Artefacts, *, pixels: float = 0.9999, error: float = 0.01) -> None:
+    """Check that an artefact computes what the network does on PyTorch, and nothing once it is closed; it is then.
+
+    Args:
+        backend: One of `SIZE`, of the artefacts' own weights.
+        artefacts: The weights and the images.
+        pixels: More than this part of mask pixels must agree.
+        error: Numbers of boxes are less than this apart.
+    """
+    import torch
+
+    from tests.deploy.test_graph import by_cell
+    from trilitenet.inference.torch_backend import TorchBackend
+    from trilitenet.models.weights import load_network
+
+    network = load_network(artefacts.folder / "weights.safetensors")
+    wanted = TorchBackend(network, "cpu").run(artefacts.images)
+    assert isinstance(backend, Backend)
+    assert backend.card == network.card
+    assert backend.canvas == SIZE
+    got = backend.run(artefacts.images)
+    assert wanted.detection is not None
+    assert got.detection is not None
+    reordered = by_cell(torch.from_numpy(wanted.detection), *SIZE).numpy()
+    assert np.abs(got.detection - reordered).max() < error
+    for task, threshold in (("drivable", 0.5), ("lane", 0.49)):
+        mask = getattr(got, task)
+        assert mask.shape == (2, *SIZE)
+        assert set(np.unique(mask)) <= {0, 255}
+        assert np.mean((mask > 0) == (getattr(wanted, task) > int(threshold * 255))) > pixels
+    backend.close()
+    backend.close()
+    with pytest.raises(BackendError, match="the model was closed; load it again"):
+        backend.run(artefacts.images)
 
 
 def _make_artefacts(folder: Path) -> None:

@@ -12,22 +12,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from filelock import FileLock
 
 import trilitenet
-from tests.artefacts import SIZE, Artefacts
+from tests.artefacts import SIZE, Artefacts, check_backend
 from tests.deploy.networks import lively_network
-from tests.deploy.test_graph import by_cell
 from trilitenet.commands.export import export
 from trilitenet.config import ArtefactInfo
 from trilitenet.deploy.executorch import build_executorch
 from trilitenet.deploy.graph import DeployGraph
 from trilitenet.deploy.layouts import LAYOUTS
 from trilitenet.errors import BackendError, ConfigError, MissingExtraError, ShapeError, WeightsError
-from trilitenet.inference.backend import Backend
 from trilitenet.inference.executorch_backend import ExecuTorchBackend, _unsaid
-from trilitenet.inference.torch_backend import TorchBackend
 from trilitenet.models.weights import load_network, save_network
 
 pytest.importorskip("executorch")
@@ -48,27 +44,9 @@ def program(artefacts: Artefacts) -> Path:
 
 
 def test_equals_the_network(artefacts: Artefacts, program: Path) -> None:
-    network = load_network(artefacts.folder / "weights.safetensors")
-    wanted = TorchBackend(network, "cpu").run(artefacts.images)
     backend = ExecuTorchBackend(program)
-    assert isinstance(backend, Backend)
-    assert backend.card == network.card
-    assert backend.canvas == SIZE
     assert backend.name == "executorch cpu"
-    got = backend.run(artefacts.images)
-    assert wanted.detection is not None
-    assert got.detection is not None
-    reordered = by_cell(torch.from_numpy(wanted.detection), *SIZE).numpy()
-    assert np.abs(got.detection - reordered).max() < 0.01
-    for task, threshold in (("drivable", 0.5), ("lane", 0.49)):
-        mask = getattr(got, task)
-        assert mask.shape == (2, *SIZE)
-        assert set(np.unique(mask)) <= {0, 255}
-        assert np.mean((mask > 0) == (getattr(wanted, task) > int(threshold * 255))) > 0.9999
-    backend.close()
-    backend.close()
-    with pytest.raises(BackendError, match=r"model\.pte: the model was closed; load it again"):
-        backend.run(artefacts.images)
+    check_backend(backend, artefacts)
 
 
 def test_load_finds_it_and_another_process_may_have_it(program: Path) -> None:

@@ -18,16 +18,14 @@ import numpy as np
 import pytest
 
 import trilitenet
-from tests.artefacts import SIZE, Artefacts
+from tests.artefacts import SIZE, Artefacts, check_backend
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
 from trilitenet.errors import BackendError, ConfigError, ShapeError, WeightsError
-from trilitenet.inference.backend import Backend
 from trilitenet.inference.exported import is_int8_onnx, prepare_input, read_metadata
 from trilitenet.inference.ncnn_backend import NcnnBackend
 from trilitenet.inference.onnx_backend import OnnxBackend
 from trilitenet.inference.openvino_backend import OpenVINOBackend
 from trilitenet.inference.tensorrt_backend import MAGIC, pack_engine, unpack_engine
-from trilitenet.models.weights import load_network
 
 BACKENDS = [
     pytest.param("model.onnx", OnnxBackend, {}, 0.9999, 0.01, id="onnxruntime"),
@@ -41,28 +39,7 @@ BACKENDS = [
 def test_equals_the_network(
     artefacts: Artefacts, name: str, kind: Any, options: dict[str, Any], pixels: float, error: float
 ) -> None:
-    import torch
-
-    from tests.deploy.test_graph import by_cell
-    from trilitenet.inference.torch_backend import TorchBackend
-
-    network = load_network(artefacts.folder / "weights.safetensors")
-    wanted = TorchBackend(network, "cpu").run(artefacts.images)
-    backend = kind(artefacts.folder / name, **options)
-    assert isinstance(backend, Backend)
-    assert backend.card == network.card
-    assert backend.canvas == SIZE
-    got = backend.run(artefacts.images)
-    assert wanted.detection is not None
-    assert got.detection is not None
-    reordered = by_cell(torch.from_numpy(wanted.detection), *SIZE).numpy()
-    assert np.abs(got.detection - reordered).max() < error
-    for task, threshold in (("drivable", 0.5), ("lane", 0.49)):
-        mask = getattr(got, task)
-        assert set(np.unique(mask)) <= {0, 255}
-        assert np.mean((mask > 0) == (getattr(wanted, task) > int(threshold * 255))) > pixels
-    backend.close()
-    backend.close()
+    check_backend(kind(artefacts.folder / name, **options), artefacts, pixels=pixels, error=error)
 
 
 @pytest.mark.parametrize(

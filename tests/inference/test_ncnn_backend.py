@@ -15,12 +15,10 @@ import numpy as np
 import pytest
 
 import trilitenet
-from tests.artefacts import SIZE, Artefacts
+from tests.artefacts import SIZE, Artefacts, check_backend
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, GRAPH_HASH_KEY
 from trilitenet.errors import BackendError, ConfigError, ShapeError, WeightsError
-from trilitenet.inference.backend import Backend
 from trilitenet.inference.ncnn_backend import NcnnBackend
-from trilitenet.models.weights import load_network
 
 pytest.importorskip("ncnn")
 pytest.importorskip("pnnx")
@@ -36,32 +34,9 @@ def copied(artefacts: Artefacts, tmp_path: Path) -> Path:
 
 
 def test_equals_the_network(artefacts: Artefacts) -> None:
-    import torch
-
-    from tests.deploy.test_graph import by_cell
-    from trilitenet.inference.torch_backend import TorchBackend
-
-    network = load_network(artefacts.folder / "weights.safetensors")
-    wanted = TorchBackend(network, "cpu").run(artefacts.images)
     backend = NcnnBackend(artefacts.folder / "model.ncnn.param", threads=1)
-    assert isinstance(backend, Backend)
-    assert backend.card == network.card
-    assert backend.canvas == SIZE
     assert backend.name == "ncnn cpu fp32"
-    got = backend.run(artefacts.images)
-    assert wanted.detection is not None
-    assert got.detection is not None
-    reordered = by_cell(torch.from_numpy(wanted.detection), *SIZE).numpy()
-    assert np.abs(got.detection - reordered).max() < 0.01
-    for task, threshold in (("drivable", 0.5), ("lane", 0.49)):
-        mask = getattr(got, task)
-        assert mask.shape == (2, *SIZE)
-        assert set(np.unique(mask)) <= {0, 255}
-        assert np.mean((mask > 0) == (getattr(wanted, task) > int(threshold * 255))) > 0.9999
-    backend.close()
-    backend.close()
-    with pytest.raises(BackendError, match="closed"):
-        backend.run(artefacts.images)
+    check_backend(backend, artefacts)
 
 
 def test_load_finds_it(artefacts: Artefacts, copied: Path) -> None:
