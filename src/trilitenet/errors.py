@@ -116,7 +116,12 @@ class TrainingError(TriLiteNetError, RuntimeError):
 
 
 def brief(error: BaseException) -> str:
-    """Return an error's kind and words for a message: its ``repr``, which of a decoding error is the whole file."""
+    """Return an error's kind and words for a message: its ``repr``, which of a decoding error is the whole file.
+
+    Of a key that is not there it says so.
+    """
+    if isinstance(error, KeyError):
+        return f"{error} is missing"
     return f"{type(error).__name__}: {error}" if isinstance(error, UnicodeError) else repr(error)
 
 

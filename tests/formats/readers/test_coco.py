@@ -98,7 +98,7 @@ def test_errors(tmp_path: Path) -> None:
         read_coco(path)
     path.write_text(json.dumps(coco(annotations=[{"hello": 1}])))
     cv2.imwrite(str(tmp_path / "one.png"), np.zeros((*SIZE, 3), np.uint8))
-    with pytest.raises(DataError, match="not as COCO has it"):
+    with pytest.raises(DataError, match=r"not as COCO has it \('image_id' is missing\)"):
         read_coco(path)
 
 
