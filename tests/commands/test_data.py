@@ -169,6 +169,15 @@ def test_lane_widths_by_split_and_for_the_others(words: list[str], widths: dict[
     assert _widths(words) == widths
 
 
+@pytest.mark.parametrize("option", ["--html", "--json"])
+def test_a_report_that_cannot_be_written_is_told_before_the_check(
+    option: str, published: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trilitenet.commands.data.check_dataset", lambda *_, **__: pytest.fail("it has begun"))
+    assert main(["data", "check", str(published), option, str(tmp_path)]) == 1
+    assert capsys.readouterr().err == f"error: {tmp_path}: cannot be written (it is a folder)\n"
+
+
 def test_check_says_what_is_wrong(
     published: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

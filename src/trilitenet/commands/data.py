@@ -14,7 +14,7 @@ import cv2
 from cyclopts import Parameter
 from rich.table import Table
 
-from trilitenet.commands.paths import NameOrPath, StrPath, one_for_several, optional_path
+from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, one_for_several, optional_path
 from trilitenet.commands.progress import show_progress
 from trilitenet.data.check_page import check_page, picture_page
 from trilitenet.data.checking import KINDS, CheckReport, check_dataset, detect_layout
@@ -227,12 +227,15 @@ def check(
 
     Raises:
         DataError: If the layout is not the published one.
+        OutputError: If a report cannot be written: as far as can be told, before the work begins.
         MissingExtraError: If the extra ``data`` is not installed.
     """
+    json_file, html = optional_path(json_file), optional_path(html)
+    for file in filter(None, (json_file, html)):
+        check_writable(file)
     with show_progress("images") as advance:
         report = check_dataset(root, workers=_workers(workers), progress=advance)
     files: list[Path] = []
-    json_file, html = optional_path(json_file), optional_path(html)
     if json_file is not None:
         write_file(json_file, json.dumps(report.to_dict(), indent=1, ensure_ascii=False))
         files.append(json_file)
