@@ -55,6 +55,12 @@ def test_a_damaged_exif_leaves_the_size_readable(tmp_path: Path, exif: bytes) ->
     assert image_size(tmp_path / "a.png") == (40, 60)
 
 
+def test_pillow_does_not_warn_of_large_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Image.new("L", (60, 40)).save(tmp_path / "a.png")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 60 * 40 - 1)  # of twice as many it is an error
+    assert image_size(tmp_path / "a.png") == (40, 60)
+
+
 @pytest.mark.parametrize(
     ("images", "names"),
     [

@@ -37,7 +37,7 @@ from trilitenet.data.reading import (
 from trilitenet.errors import DataError, few, import_extra
 from trilitenet.processing.boxes import best_side_ratio
 from trilitenet.processing.cores import ProcessPool
-from trilitenet.processing.images import BROKEN, upright_size
+from trilitenet.processing.images import BROKEN, open_image, upright_size
 
 __all__ = ["KINDS", "CheckReport", "Finding", "check_dataset", "detect_layout"]
 
@@ -386,7 +386,7 @@ def _look_at_image(
         return None, b"", 0, b""
     digest = hashlib.blake2b(data, digest_size=12).digest()
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with open_image(io.BytesIO(data)) as image:
             size = upright_size(image)
             # JPEGs are decoded at 1/2, 1/4 or 1/8: a whole file is read, in a part of the time.
             image.draft("L", (64, 64))
@@ -446,7 +446,7 @@ def _look_at_mask(
 ) -> float | None:
     """Return the part of the mask that is foreground."""
     try:
-        with Image.open(path) as picture:
+        with open_image(path) as picture:
             picture.load()
     except BROKEN as error:
         faults.append(("mask-unreadable", f"{where} ({_reason(error)})"))

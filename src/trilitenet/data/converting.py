@@ -25,7 +25,6 @@ from typing import Any, Final, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from trilitenet.data.description import (
     DESCRIPTION_FILE,
@@ -58,7 +57,7 @@ from trilitenet.data.records import (
 )
 from trilitenet.errors import ConfigError, DataError, OutputError, replacing, writing
 from trilitenet.processing.cores import ProcessPool
-from trilitenet.processing.images import BROKEN
+from trilitenet.processing.images import BROKEN, open_image
 
 __all__ = ["ConversionOptions", "ConversionReport", "convert", "drivable_mask", "lane_mask"]
 
@@ -470,7 +469,7 @@ def _mask_of(file: MaskFile, size: tuple[int, int], *, keep_alternative: bool) -
     the background has been given one, and where the picture holds no value with a meaning.
     """
     try:
-        with Image.open(file.path) as picture:
+        with open_image(file.path) as picture:
             picture.load()
             colours = any(isinstance(value, tuple) for value in file.values)
             if colours or (not file.values and picture.mode.startswith("RGB")):

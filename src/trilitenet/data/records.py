@@ -10,10 +10,9 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from trilitenet.errors import DataError, ShapeError
-from trilitenet.processing.images import BROKEN, upright_size
+from trilitenet.processing.images import BROKEN, open_image, upright_size
 from trilitenet.processing.serialise import decode_mask
 
 __all__ = [
@@ -224,7 +223,7 @@ def image_size(path: Path) -> tuple[int, int]:
         DataError: If it is not an image.
     """
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             return upright_size(image)
     except BROKEN as error:
         raise DataError(f"{path}: not an image that can be read ({error})") from error

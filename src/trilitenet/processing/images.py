@@ -15,7 +15,7 @@ from PIL import ExifTags, Image
 
 from trilitenet.errors import InputError, ShapeError
 
-__all__ = ["BROKEN", "read_image", "to_rgb", "upright_size"]
+__all__ = ["BROKEN", "open_image", "read_image", "to_rgb", "upright_size"]
 
 
 BROKEN: Final = (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error, Image.DecompressionBombError)
@@ -77,15 +77,24 @@ def read_image(image: str | Path | bytes | Image.Image | NDArray[Any]) -> NDArra
     if not data:
         raise InputError(f"{name}: is empty")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            opened = Image.open(io.BytesIO(data))
+        opened = open_image(io.BytesIO(data))
     except BROKEN as error:
         if data[4:8] == b"ftyp" and data[8:12] in _HEIF:
             raise InputError(f"{name}: HEIC images cannot be read; save it as JPEG") from error
         raise InputError(f"{name}: is not an image that can be read ({_reason(error)})") from error
     with opened:
         return _decode(opened, name)
+
+
+def open_image(file: Path | io.BytesIO) -> Image.Image:
+    """Open an image, its pixels not yet decoded, without Pillow's warning of large ones; it refuses the huge itself.
+
+    Raises:
+        OSError: Or another of `BROKEN`, if it is not an image that can be read.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        return Image.open(file)
 
 
 def to_rgb(array: NDArray[Any]) -> NDArray[np.uint8]:
