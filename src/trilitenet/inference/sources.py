@@ -474,6 +474,7 @@ def find_sources(
             failures.append(Failure(_without_secrets(name), str(error)))
 
     taken: set[Path] = set()
+    place = _placing()
     for name in dict.fromkeys(os.fspath(name) for name in names):
         if re.match(r"[a-z][a-z0-9+.-]+://", name, re.IGNORECASE):
             add(functools.partial(_open_url, name, clip), name)
@@ -485,7 +486,7 @@ def find_sources(
             add(functools.partial(SequenceReader, name, clip, rate=rate), name)
         else:
             try:
-                paths = _expand(name)
+                paths = _expand(name, place)
             except InputError as error:
                 failures.append(Failure(name, str(error)))
                 continue
@@ -496,10 +497,10 @@ def find_sources(
                 if (shown := _printable(str(path))) != str(path):
                     failures.append(Failure(shown, f"{shown}: its name is not UTF-8; rename it"))
                     continue
-                place = _place(path)
-                if place in taken:
+                where = place(path)
+                if where in taken:
                     continue
-                taken.add(place)
+                taken.add(where)
                 if path.suffix.lower() in VIDEO_SUFFIXES:
                     add(functools.partial(VideoReader, path, clip), str(path))
                 else:
@@ -544,8 +545,11 @@ def _without_secrets(url: str) -> str:
     return urllib.parse.urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
 
 
-def _expand(name: str) -> list[Path]:
-    """Return the files that a path or a pattern stands for, in natural order (2 before 10)."""
+def _expand(name: str, place: Callable[[Path], Path]) -> list[Path]:
+    """Return the files that a path or a pattern stands for, in natural order (2 before 10).
+
+    ``place`` is what `_placing` returns.
+    """
     path = Path(name)
     if path.is_dir():
         files = [child for child in path.iterdir() if _is_file(child) and not child.name.startswith(".")]
@@ -559,7 +563,7 @@ def _expand(name: str) -> list[Path]:
         places: dict[Path, Path] = {}
         # The shortest way to each: a link to a folder above it leads to all in that again and again.
         for match in sorted(map(Path, glob.glob(name, recursive=True)), key=lambda path: len(path.parts)):  # noqa: PTH207
-            places.setdefault(_place(match), match)
+            places.setdefault(place(match), match)
         files = [match for match in places.values() if _is_file(match)]
         if not files:
             raise InputError(f"{name}: no file matches")
@@ -568,9 +572,13 @@ def _expand(name: str) -> list[Path]:
     return sorted(files, key=lambda file: [int(t) if t.isdecimal() else t for t in re.split(r"(\d+)", str(file))])
 
 
-def _place(path: Path) -> Path:
-    """Return where a path is, by whatever ways; a link of another name is a place, and gives a result, of its own."""
-    return path.parent.resolve() / path.name
+def _placing() -> Callable[[Path], Path]:
+    """Return what tells where a path is, by whatever ways, and looks each folder up once.
+
+    A link of another name is a place, and gives a result, of its own.
+    """
+    resolve = functools.cache(Path.resolve)
+    return lambda path: resolve(path.parent) / path.name
 
 
 def _is_file(path: Path) -> bool:
