@@ -83,9 +83,20 @@ def test_the_table_tells_the_input_of_each_model(monkeypatch: pytest.MonkeyPatch
     assert [row.split(" | ")[3] for row in rows] == ["64x32", "128x64", "160x96"]
 
 
-def test_whole_frames(artefacts: Artefacts) -> None:
-    result = benchmark(str(artefacts.folder / "model.xml"), stage="frame", rounds=2, warmup=0, source=(90, 160))
-    assert result.timings[0].stage == "frame"
+def test_whole_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    backend, seen = ColourBackend(canvas=(64, 128)), []
+    plain = Predictor.perceive
+
+    def perceive(self: Predictor, images: list[NDArray[np.uint8]]) -> object:
+        seen.append([image.shape for image in images])
+        return plain(self, images)
+
+    monkeypatch.setattr("trilitenet.commands.benchmark.load", lambda model, **_: Predictor(backend))
+    monkeypatch.setattr(Predictor, "perceive", perceive)
+    (row,) = benchmark("a", stage="frame", batch=(10,), rounds=2, warmup=0, source=(90, 160)).timings
+    assert (row.stage, row.size) == ("frame", (64, 128))
+    assert seen == [[(90, 160, 3)] * 10] * 3
+    assert backend.batches == [(10, 64, 128, 3)] * 3  # in one batch
 
 
 def test_cost_table() -> None:

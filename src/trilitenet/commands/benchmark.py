@@ -244,10 +244,9 @@ class _Call:
             self.run: Callable[[], object] = lambda: predictor.backend.run(images)
         else:
             frames: list[NDArray[np.uint8]] = [generator.integers(0, 256, (*source, 3), np.uint8)] * batch
-            if predictor.backend.canvas is None:
-                predictor = Predictor(predictor.backend, predictor.thresholds, long_side=max(size))
-            self.size = predictor.fit(frames[0]).canvas
-            self.run = lambda: predictor.perceive(frames)
+            whole = Predictor(predictor.backend, predictor.thresholds, long_side=max(size), batch_size=batch)
+            self.size = whole.fit(frames[0]).canvas
+            self.run = lambda: whole.perceive(frames)
 
     def once(self) -> None:
         """Run once and note how long the model took to its first result, loading and all."""
