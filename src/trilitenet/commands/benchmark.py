@@ -9,6 +9,7 @@ import json
 import math
 import os
 import platform
+import re
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -49,7 +50,8 @@ class Timing:
         frames_per_second: Images a second at the median.
         ratio: Median over the rounds of the first entry's time an image over this one's: above 1 is faster.
         first_result: Seconds from loading the model to its first result.
-        joules: A frame, of the processor package or the GPU; None where it cannot be read.
+        joules: A frame, of the GPU where the runtime is on one, else of the processor package; None where it cannot be
+            read.
         watts: Mean over the measurement; None likewise.
     """
 
@@ -257,19 +259,19 @@ class _Call:
 
 
 def _measure(calls: Sequence[_Call], rounds: int, warmup: int) -> tuple[Timing, ...]:
-    meter = _Meter()
+    meters = [_meter(call.entry.predictor.backend.name) for call in calls]
     for call in calls:
         call.once()
     for _ in range(warmup):
         for call in calls:
             call.run()
     for _ in range(rounds):
-        for call in calls:
-            before = meter.read()
+        for call, meter in zip(calls, meters, strict=True):
+            before = meter()
             started = time.perf_counter()
             call.run()
             call.milliseconds.append(1e3 * (time.perf_counter() - started))
-            after = meter.read()
+            after = meter()
             if before is not None and after is not None and after >= before:
                 call.joules.append(after - before)
     first = np.array(calls[0].milliseconds) / calls[0].batch
@@ -298,29 +300,30 @@ def _measure(calls: Sequence[_Call], rounds: int, warmup: int) -> tuple[Timing, 
     return tuple(timings)
 
 
-class _Meter:
-    """Energy in joules since some time: the processor package by RAPL, or the GPU by NVML; whatever can be read."""
+def _meter(backend: str) -> Callable[[], float | None]:
+    """Return what reads the joules since some time of what a backend runs on, or None where they cannot be read.
 
-    def __init__(self) -> None:
-        self._read: Callable[[], float] | None = None
+    That is the GPU (by NVML) where the backend's name has it, else the processor package (by RAPL).
+    """
+    on_gpu = re.search(r"cuda:?(\d*)", backend)
+    if on_gpu is None:
         for rapl in sorted(Path("/sys/class/powercap").glob("*-rapl:0/energy_uj")):
             if os.access(rapl, os.R_OK):
-                self._read = lambda rapl=rapl: int(rapl.read_text(encoding="ascii")) / 1e6
-        try:
-            import pynvml
+                return lambda: int(rapl.read_text(encoding="ascii")) / 1e6
+        return lambda: None
+    try:
+        import pynvml
 
-            pynvml.nvmlInit()
-            gpu = pynvml.nvmlDeviceGetHandleByIndex(0)
-            self._read = lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3
-        except (ImportError, OSError, RuntimeError):
-            pass
-        except Exception as error:  # NVML's own errors derive from Exception alone
-            if type(error).__module__ != "pynvml":
-                raise
-
-    def read(self) -> float | None:
-        """Return joules, or None where nothing can be read."""
-        return None if self._read is None else self._read()
+        pynvml.nvmlInit()
+        gpu = pynvml.nvmlDeviceGetHandleByIndex(int(on_gpu[1] or 0))
+        pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu)  # older GPUs refuse
+    except (ImportError, OSError, RuntimeError):
+        return lambda: None
+    except Exception as error:  # NVML's own errors derive from Exception alone
+        if type(error).__module__ != "pynvml":
+            raise
+        return lambda: None
+    return lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3
 
 
 def _machine(threads: int | None, streams: int) -> dict[str, str]:
