@@ -12,12 +12,16 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.data.published import write_published
 from tests.formats.readers import raw_bdd
 from trilitenet.apps.cli import main
+from trilitenet.commands import data as command
 from trilitenet.commands.data import _widths, check, convert, prepare, show
 from trilitenet.commands.train import training_data
+from trilitenet.data.converting import ConversionOptions
+from trilitenet.data.description import DatasetDescription
 from trilitenet.data.prepared import PreparedDataset, open_dataset
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.recipe import TrainConfig
@@ -88,6 +92,29 @@ def test_convert_options(raw: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out/images/val").exists()
 
 
+def test_what_is_asked_of_a_conversion_reaches_it(raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, Any] = {}
+    monkeypatch.setattr(command, "run_conversion", lambda _, out, chosen, **more: asked.update(more, chosen=chosen))
+    classes = tmp_path / "classes.yaml"
+    classes.write_text("classes: {small: [car]}\nignore: [rider]\nname: ours\nlicence: mine\n")
+    options: dict[str, Any] = {"crosswalk": True, "vertical": True, "pair_edges": False, "max_gap": 7.0,
+                               "keep_alternative": True, "images": "copy"}  # fmt: skip
+    convert("bdd100k", raw, tmp_path, classes=classes, lane_width=("4",), splits=("val",), workers=3, **options)
+    expected = ConversionOptions(classes={"small": ("car",)}, ignore=("rider",), lane_width={"*": 4.0}, **options)
+    del asked["progress"]
+    description = DatasetDescription(name="ours", licence="mine", source="bdd100k: raw")
+    assert asked == {"chosen": expected, "splits": ("val",), "workers": 3, "description": description}
+
+
+def test_each_kind_has_its_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = []
+    for kind in ("coco", "yolo", "cvat", "masks"):
+        monkeypatch.setattr(command, f"read_{kind}", lambda raw, mapping, kind=kind: read.append((kind, raw)))
+        with pytest.raises(AttributeError):  # of the records, which are none
+            convert("there", tmp_path, kind=kind)
+    assert read == [("coco", "there"), ("yolo", "there"), ("cvat", "there"), ("masks", "there")]
+
+
 @pytest.mark.parametrize("images", ["link", "copy"])
 def test_a_full_disk_is_told_in_one_line(
     raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, images: Literal["link", "copy"]
@@ -150,8 +177,9 @@ def test_convert_wants_its_words(raw: Path, tmp_path: Path) -> None:
         convert("bdd100k", raw, tmp_path / "out", kind="bdd100k")
     with pytest.raises(ConfigError, match="lane width"):
         convert("bdd100k", raw, tmp_path / "out", lane_width=["wide"])
-    with pytest.raises(ConfigError, match="above 0 and finite, got 'train=nan'"):
-        convert("bdd100k", raw, tmp_path / "out", lane_width=["train=nan"])
+    for width in ("nan", "inf", "0"):
+        with pytest.raises(ConfigError, match=f"above 0 and finite, got 'train={width}'"):
+            convert("bdd100k", raw, tmp_path / "out", lane_width=[f"train={width}"])
     with pytest.raises(ConfigError, match="no split 'trian'; there are train, val"):
         convert("bdd100k", raw, tmp_path / "out", lane_width=["trian=8", "4"])
 
@@ -186,7 +214,9 @@ def test_check_says_what_is_wrong(
     html, document = tmp_path / "report.html", tmp_path / "report.json"
     words = ["data", "check", str(published), "--html", str(html), "--json", str(document), "--workers", "1"]
     assert main(words) == 0
-    assert "nothing wrong" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "nothing wrong" in shown
+    assert re.search(r"train\W+12\W+11\W+9\W+10\W+19 car, 4 ignored\W", shown)
     assert json.loads(document.read_text())["images"] == {"train": 12, "val": 6}
     page = html.read_text()
     assert page.count("<svg") >= 3
@@ -227,6 +257,8 @@ def test_show_sheets_and_pages(published: Path, tmp_path: Path) -> None:
     )
     assert both == train + val
     assert len(set(both)) == 4
+    others = show(published, tmp_path / "others.html", split="train", count=2, seed=1).output.read_text()
+    assert not any(image in others for image in train)
     wrong: dict[str, Any] = {"columns": 0, "seed": -1, "count": 0, "width": 0}
     for name, value in wrong.items():
         with pytest.raises(ConfigError, match=name):
@@ -250,6 +282,12 @@ def test_show_sheets_and_pages(published: Path, tmp_path: Path) -> None:
         show(published, tmp_path / "x.pdf")
 
 
+def test_a_sheet_keeps_its_colours(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "contact_sheet", lambda *_, **__: np.full((2, 3, 3), (250, 100, 0), np.uint8))
+    show(published, tmp_path / "sheet.png", count=1)
+    assert (np.asarray(Image.open(tmp_path / "sheet.png")) == (250, 100, 0)).all()
+
+
 def test_prepare_and_read_back(published: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["data", "prepare", str(published), "--size", "64", "96", "--workers", "1"]) == 0
     assert "training uses it by itself" in capsys.readouterr().out
@@ -259,6 +297,23 @@ def test_prepare_and_read_back(published: Path, tmp_path: Path, capsys: pytest.C
     assert not result.by_itself
     with pytest.raises(DataError, match="prepared data set"):
         show(tmp_path / "out", tmp_path / "x.png")
+
+
+def test_what_is_asked_of_a_preparation_reaches_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, Any] = {}
+
+    def run(*folders: Path, **options: Any) -> dict[str, int]:
+        asked.update(options, folders=folders)
+        (tmp_path / "train-0.tar").write_bytes(b"12345")
+        return {"val": 1}
+
+    monkeypatch.setattr(command, "run_preparation", run)
+    options: dict[str, Any] = {"splits": ("val",), "images": "jpeg", "quality": 80, "mask_above": 9, "shard_size": 5,
+                               "workers": 3}  # fmt: skip
+    done = prepare("data", tmp_path, size=(64, 96), classes=("car",), **options)
+    del asked["progress"]
+    assert asked == {"folders": ("data", tmp_path), "canvas": (64, 96), "class_names": ("car",), **options}
+    assert (done.images, done.size) == ({"val": 1}, 5)
 
 
 def test_training_uses_the_prepared_copy(published: Path) -> None:
