@@ -124,6 +124,8 @@ def test_reports_are_compared(run: tuple[Report, Path], data: Path, tmp_path: Pa
     assert (tmp_path / "comparison.html").exists()
     with pytest.raises(OutputError, match="--overwrite"):
         compare(folder, output=tmp_path)
+    assert compare(folder, output=tmp_path, overwrite=True, resamples=0).resamples == 0
+    assert json.loads((tmp_path / "comparison.json").read_text())["names"] == ["tiny.safetensors"]
     with pytest.raises(ConfigError, match="at least one"):
         compare()
     with pytest.raises(ConfigError, match=r"report\.json: given more than once"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,8 @@ def test_import_then_info(published: Path, tmp_path: Path, capsys: pytest.Captur
         assert part in text
     info(str(out), json_output=True)
     assert json.loads(capsys.readouterr().out)["class_names"] == ["vehicle"]
+    with pytest.raises(WeightsError):
+        import_weights(published, tmp_path / "small.safetensors", variant="small")
 
 
 def test_an_existing_file_is_kept(published: Path, tmp_path: Path) -> None:
@@ -60,7 +63,7 @@ def test_info_of_what_is_not_there() -> None:
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("scenes")
-    synthesize(root, count=3, seed=5, size=(192, 320), split="val")
+    synthesize(root, count=3, seed=5, size=(192, 320), split="test")
     return root
 
 
@@ -68,21 +71,36 @@ def test_finished_weights_hold_thresholds_figures_and_what_people_say(
     scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first, second = tmp_path / "first.yaml", tmp_path / "second.yaml"
-    first.write_text("licence: research only\nprovenance: {labels: exact}\nnotes: [far vehicles are missed]\n")
+    first.write_text(
+        "licence: research only\ntraining_data: [ours]\nprovenance: {labels: exact}\nnotes: [far vehicles are missed]\n"
+    )
     second.write_text("provenance: {hours: '2'}\nnotes: [night is worse]\n")
     out = tmp_path / f"{'o' * 240}.safetensors"  # nearly as long as file systems take names
-    card = finish("tiny", out, data=scenes, card=(first, second), input_size=(192, 320), iou=0.5)
+    card = finish("tiny", out, data=scenes, split="test", card=(first, second), input_size=(192, 320), iou=0.5)
     told = capsys.readouterr().out
     words = "".join(told.split())  # long paths are broken into lines
     assert words.startswith(f"model{out}(")
-    assert f"data{scenes}val,3images" in words
+    assert f"data{scenes}test,3images" in words
     assert told.endswith(f"\nwritten to {out}\n")
     assert read_card(out) == card
-    assert card.licence == "research only"
+    assert (card.licence, card.training_data) == ("research only", ("ours",))
     assert {"labels": "exact", "hours": "2"}.items() <= card.provenance.items()
     assert card.notes[-2:] == ("far vehicles are missed", "night is worse")
     assert (card.input_size, card.thresholds.iou) == ((192, 320), 0.5)
-    assert 0 < card.metrics["val fair/drivable/iou"] <= 1
+    assert 0 < card.metrics["test fair/drivable/iou"] <= 1
+    info(out)
+    shown = re.sub(" {2,}", "  ", capsys.readouterr().out)
+    limits = card.thresholds
+    assert limits.drivable != limits.lane
+    for part in (
+        f"box {limits.confidence:g} (NMS 0.5), drivable {limits.drivable:g}, lane {limits.lane:g}\n",
+        "trained on  ours\n",
+        "research only\n",
+        "night is worse\n",
+        "exact\n",
+        f"test fair/drivable/iou  {card.metrics['test fair/drivable/iou']:g}\n",
+    ):
+        assert part in shown
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
     shipped = load_network("tiny").state_dict()
     assert all(torch.equal(tensor, shipped[name]) for name, tensor in load_network(out).state_dict().items())
@@ -111,10 +129,15 @@ def test_an_input_size_that_the_network_cannot_take_is_refused(
     assert not list(tmp_path.iterdir())
 
 
-def test_finishing_into_a_file_that_is_taken_for_a_folder(scenes: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_finished_is_told_before_the_work(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trilitenet.commands.weights.load_network", lambda _: pytest.fail("it has begun"))
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="cannot be written"):
         finish("tiny", tmp_path / "file" / "out.safetensors", data=scenes)
+    with pytest.raises(ConfigError, match="--batch-size must be at least 1, got 0"):
+        finish("tiny", tmp_path / "out.safetensors", data=scenes, batch_size=0)
 
 
 def test_a_training_state_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -142,8 +165,8 @@ def test_every_shipped_file_says_what_it_is() -> None:
 def test_the_figures_are_those_of_the_file_which_is_fp16_unless_asked_otherwise(scenes: Path, tmp_path: Path) -> None:
     for full, dtype in ((False, torch.float16), (True, torch.float32)):
         out = tmp_path / f"{full}.safetensors"
-        card = finish("tiny", out, data=scenes, input_size=(192, 320), full=full)
+        card = finish("tiny", out, data=scenes, split="test", input_size=(192, 320), full=full)
         assert {tensor.dtype for tensor in load_file(out).values() if tensor.is_floating_point()} == {dtype}
-        report = evaluate(str(out), data=scenes, resamples=0, worst=0)
-        figures = {f"val {name}": round(figure.value, 4) for name, figure in report.figures.items()}
+        report = evaluate(str(out), data=scenes, split="test", resamples=0, worst=0)
+        figures = {f"test {name}": round(figure.value, 4) for name, figure in report.figures.items()}
         assert card.metrics == pytest.approx(figures, nan_ok=True)
