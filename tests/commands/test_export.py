@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import math
 import os
 import pickle
 import shutil
@@ -16,9 +17,10 @@ from PIL import Image
 
 import trilitenet
 from tests.artefacts import Artefacts
+from tests.fakes import ColourBackend
 from trilitenet.commands import export as command
 from trilitenet.commands.export import export, find_pictures
-from trilitenet.config import TASKS, ArtefactInfo
+from trilitenet.config import TASKS, ArtefactInfo, Thresholds
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.synthetic_files import write_dataset
 from trilitenet.deploy.onnx import build_onnx
@@ -97,6 +99,12 @@ def test_pictures_are_never_masks(tmp_path: Path) -> None:
         find_pictures(tmp_path, 8, "train")
     (tmp_path / "images" / "val").rename(tmp_path / "images" / "train")
     assert [path.parent.name for path in find_pictures(tmp_path, 8, "val")] == ["train", "train"]
+
+
+def test_pictures_are_from_all_over_a_folder(tmp_path: Path) -> None:
+    for name in ("4.jpg", "1.jpg", "0.jpg", "notes.txt", "3.jpg", "2.jpg"):
+        (tmp_path / name).touch()
+    assert [path.name for path in find_pictures(tmp_path, 3, "train")] == ["0.jpg", "2.jpg", "4.jpg"]
 
 
 def test_what_is_no_folder_of_pictures_is_told(tmp_path: Path) -> None:
@@ -254,6 +262,28 @@ def test_masks_are_decisions_or_with_portable_logits_by_default(
     assert kept == ["decision", "probability", "logit", "logit"]
 
 
+def test_an_artefact_is_compared_on_the_pictures_asked_for(
+    artefacts: Artefacts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept: list[object] = []
+    monkeypatch.setattr(command, "build_onnx", lambda *_, **__: None)
+    monkeypatch.setattr(command, "_canvases", lambda source, *_: source)
+    monkeypatch.setattr(command, "_keep", lambda *arguments: kept.append(arguments[-1]))
+    sources: tuple[dict[str, str], ...] = ({"frames": "a", "calibration": "b"}, {"calibration": "b"}, {})
+    for source in sources:
+        export(str(artefacts.folder / "weights.safetensors"), size="64x128", output=tmp_path / "a.onnx", **source)  # type: ignore[arg-type]
+    assert kept == [Path("a"), Path("b"), None]
+
+
+def test_an_artefact_is_compared_at_the_thresholds_of_its_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    network = build_network("tiny")
+    network.card = dataclasses.replace(network.card, thresholds=Thresholds(confidence=0.2, drivable=0.4, lane=0.6))
+    kept: list[Any] = []
+    monkeypatch.setattr(command, "compare", lambda *arguments, **options: kept.extend((arguments[3], options)))
+    command._compare(network, ColourBackend(), ArtefactInfo("onnx", "int8", (64, 128)), [])
+    assert kept == [TOLERANCES["int8"], {"masks": (0.4, 0.6), "confidence": 0.2}]
+
+
 @pytest.mark.slow
 def test_openvino_with_synthetic_frames(artefacts: Artefacts, tmp_path: Path) -> None:
     path = tmp_path / "made" / "model.xml"
@@ -296,6 +326,7 @@ def test_tensorrt_without_tensorrt_says_how(artefacts: Artefacts, tmp_path: Path
     assert done.path == tmp_path / "a.onnx"
     assert "no engine was built" in done.summary()
     assert "trtexec --onnx=" in done.summary()
+    assert " --fp16 " in done.summary()
     assert trilitenet.load(done.path).backend.canvas == (64, 128)
 
 
@@ -458,22 +489,22 @@ def test_the_drop_is_that_of_the_worst_of_all_tasks(
     assert set(command.DROP_SCORES.values()) <= set(FIGURES)
     write_dataset(tmp_path / "data", "val", 2, 0, size=(96, 160))
     network = load_network(traced)
-    losses = iter([0.0, 0.02, 0.03])
+    detection, drivable, lane = "fair/detection/ap50", "fair/drivable/miou", "fair/lane/iou"
+    changes = iter([{}, {detection: 0.48}, {drivable: 0.47}, {lane: 0.46}, {lane: math.nan}])
     canvases = []
 
     def worse(predictor: Predictor, *arguments: Any, **options: Any) -> Report:
         canvases.append(predictor.backend.canvas)
         report = evaluate(predictor, *arguments, **options)
-        figures = {key: Figure(0.5, None, None) for key in report.figures}
-        figures["fair/detection/ap50"] = Figure(0.5 - next(losses), None, None)
-        return dataclasses.replace(report, figures=figures)
+        values = dict.fromkeys(report.figures, 0.5) | next(changes)
+        return dataclasses.replace(report, figures={key: Figure(value, None, None) for key, value in values.items()})
 
     monkeypatch.setattr(command, "evaluate", worse)
     path = export(traced, output=tmp_path / "a.onnx", size="64x128").path
     drop = command._Drop(network, (64, 128), tmp_path / "data")
-    assert drop.measure(OnnxBackend(path)) == pytest.approx(2.0)
-    assert drop.measure(OnnxBackend(path)) == pytest.approx(3.0)
-    assert canvases == [(64, 128)] * 3  # the network is looked at once
+    losses = [drop.measure(OnnxBackend(path)) for _ in range(4)]
+    assert losses == pytest.approx([2.0, 3.0, 4.0, 50.0])  # what cannot be told is lost
+    assert canvases == [(64, 128)] * 5  # the network is looked at once
     monkeypatch.undo()
     for labels in ("det_annotations", "da_seg_annotations", "ll_seg_annotations"):
         shutil.rmtree(tmp_path / "data" / labels)

@@ -2,9 +2,11 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from trilitenet.commands import export as command
 from trilitenet.commands.export import Exported, export
 from trilitenet.errors import BackendError, OutputError
 
@@ -34,3 +36,25 @@ def test_what_is_not_written_is_named_as_the_user_knows_it(tmp_path: Path, monke
     with pytest.raises(BackendError) as caught:
         export("tiny", format="triton", output=tmp_path, size="64x96")
     assert str(caught.value) == f"{tmp_path / 'tiny'}: not written, it differs from the network"
+
+
+def test_what_is_asked_of_a_graph_reaches_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, Any] = {}
+
+    def build(_model: str, *, output: Path, **options: Any) -> Exported:
+        asked.update(options)
+        raise BackendError(f"{output}: not written")
+
+    monkeypatch.setattr(command, "export", build)
+    plain: dict[str, Any] = {
+        "precision": "fp32", "size": "384x640", "calibration": None, "calibration_frames": 500, "max_drop": None,
+        "nms": False, "portable": False, "masks": None, "mask_scale": 1, "bgr": False, "layout": "auto", "frames": None,
+    }  # fmt: skip
+    quantised: dict[str, Any] = {
+        "precision": "int8", "size": "64x128", "calibration": tmp_path, "calibration_frames": 7, "max_drop": 1.0,
+        "masks": "probability", "mask_scale": 2, "bgr": True, "layout": "pixels", "frames": tmp_path / "frames",
+    }  # fmt: skip
+    for options in (quantised, {"nms": True}, {"portable": True}):
+        with pytest.raises(BackendError):
+            export("tiny", format="triton", output=tmp_path / "repository", **options)
+        assert asked == {"format": "onnx"} | plain | options
