@@ -250,16 +250,19 @@ def _no_work(*_: object) -> Any:
     raise AssertionError("the work began")
 
 
-def test_masks_are_decisions_or_with_portable_logits_by_default(
+def test_masks_are_decisions_or_with_portable_logits_by_default_and_its_graph_is_plain(
     artefacts: Artefacts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kept = []
-    monkeypatch.setattr(command, "build_onnx", lambda *_, **__: None)
-    monkeypatch.setattr(command, "_keep", lambda _network, _built, info, *_: kept.append(info.masks))
+    monkeypatch.setattr(command, "build_onnx", lambda graph, *_, **__: graph.layout)
+    monkeypatch.setattr(
+        command, "_keep", lambda _network, layout, info, *_: kept.append((info.masks, info.input, layout.maximum))
+    )
     weights = str(artefacts.folder / "weights.safetensors")
     for options in ({}, {"masks": "probability"}, {"portable": True}, {"portable": True, "masks": "logit"}):
         export(weights, size="64x128", output=tmp_path / "a.onnx", **options)
-    assert kept == ["decision", "probability", "logit", "logit"]
+    pixels, portable = ("uint8_nhwc", True), ("float_nchw", False)
+    assert kept == [("decision", *pixels), ("probability", *pixels), ("logit", *portable), ("logit", *portable)]
 
 
 def test_an_artefact_is_compared_on_the_pictures_asked_for(
@@ -438,7 +441,7 @@ def test_int8_keeps_as_little_in_floating_point_as_the_scores_allow(
 ) -> None:
     for split, count in (("train", 3), ("val", 1)):
         write_dataset(tmp_path / "data", split, count, 0, size=(32, 64))
-    calls: list[tuple[int, tuple[str, ...]]] = []
+    calls: list[tuple[Any, tuple[str, ...]]] = []
     left = iter(drops)
 
     class Drop:
@@ -447,7 +450,8 @@ def test_int8_keeps_as_little_in_floating_point_as_the_scores_allow(
         def measure(self, backend: object) -> float:
             return next(left)
 
-    monkeypatch.setattr(command, "quantize_onnx", lambda built, inputs, keep: calls.append((len(inputs), tuple(keep))))
+    monkeypatch.setattr(command, "quantize_onnx", lambda built, inputs, keep: calls.append((inputs, tuple(keep))))
+    monkeypatch.setattr(command, "prepare_input", lambda image, told: (image.shape, told))
     monkeypatch.setattr(command, "_Drop", Drop)
     monkeypatch.setattr(command, "_write", lambda *_: None)
     monkeypatch.setattr(command, "_open", lambda *_: None)
@@ -462,7 +466,8 @@ def test_int8_keeps_as_little_in_floating_point_as_the_scores_allow(
         assert [keep for _, keep in calls] == list(KEEP_STEPS)
     else:
         assert command._export_int8(*arguments).notes == notes
-        assert calls[-1] == (3, KEEP_STEPS[step])  # on the training split
+        # On the training split, as the artefact takes it.
+        assert calls[-1] == ([((32, 64, 3), info)] * 3, KEEP_STEPS[step])
 
 
 def test_suppression_inside_is_not_overridden_silently(traced: str, tmp_path: Path) -> None:
