@@ -62,6 +62,12 @@ def test_samples_are_whole_and_varied(scenes: list[Scene]) -> None:
     assert np.mean([scene.sample.drivable.mean() for scene in scenes]) > 0.1  # type: ignore[union-attr]
 
 
+@pytest.mark.parametrize(("size", "index"), [((128, 32), 9), ((128, 64), 9), ((128, 32), 923)])
+def test_a_tall_picture_shows_what_reaches_behind_the_camera(size: tuple[int, int], index: int) -> None:
+    """A tree, a house, a lamp at night: near enough for its top to be behind the plane of a camera that looks down."""
+    assert SyntheticScenes(1, size)[index].image.shape == (*size, 3)
+
+
 def test_night_is_darker_than_day(scenes: list[Scene]) -> None:
     bright = {"daytime": [0.0], "night": [0.0]}
     for scene in scenes:

@@ -87,6 +87,8 @@ def draw_item(world: World, item: Item, image: NDArray[np.uint8], ids: NDArray[n
     scale = camera.fx / x
     if item.kind in ("tree", "bush"):
         foot = camera.to_pixels(np.array([[x, y, 0.0], [x, y, item.height]]))
+        if np.isnan(foot).any():
+            return
         sprite = _tree(item.style % 20) if item.kind == "tree" else _bush(item.style % 8)
         _paste(image, ids, sprite, foot, item.width * scale, light, x, y)
     elif item.kind == "building":
@@ -102,7 +104,7 @@ def draw_item(world: World, item: Item, image: NDArray[np.uint8], ids: NDArray[n
                         [x, y + item.width, item.height + 0.08], [x, y, item.height - 0.1]])  # fmt: skip
         pixels = camera.to_pixels(arm)
         fill(image, ids, pixels, tone)
-        if light.time != "day":
+        if light.time != "day" and not np.isnan(pixels).any():
             u, v = pixels[1:3].mean(axis=0)
             lamps.append(Lamp(float(u), float(v), max(0.6, scale * 0.15), (255.0, 214.0, 150.0), 0.8, SCENERY))
     elif item.kind == "post":
@@ -225,6 +227,8 @@ def _draw_building(world: World, item: Item, image: NDArray[np.uint8], ids: NDAr
     for (ax, ay), (bx, by), gain in (((x0, y0), (x2, y2), 0.72), ((x0, y0), (x1, y1), 1.0)):
         corners = np.array([[ax, ay, item.height], [bx, by, item.height], [bx, by, 0.0], [ax, ay, 0.0]])
         pixels = camera.to_pixels(corners)
+        if np.isnan(pixels).any():
+            continue
         left, right = max(0, int(pixels[:, 0].min()) - 1), min(width, int(pixels[:, 0].max()) + 2)
         top, bottom = max(0, int(pixels[:, 1].min()) - 1), min(height, int(pixels[:, 1].max()) + 2)
         if right - left < 2 or bottom - top < 2:
