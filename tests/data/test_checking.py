@@ -256,6 +256,13 @@ def test_other_layouts_are_named(tmp_path: Path) -> None:
             check_dataset(folder)
 
 
+def test_images_without_folders_of_splits_are_not_found_clean(root: Path) -> None:
+    for folder in root.glob("*/train"):
+        shutil.copytree(folder, root / "flat" / folder.parent.name)
+    with pytest.raises(DataError, match="looks like images that are in no folder of a split, not the published layout"):
+        check_dataset(root / "flat")
+
+
 def test_coco_in_one_file_at_the_root_is_named(tmp_path: Path) -> None:
     (tmp_path / "empty.json").touch()
     (tmp_path / "notes.json").write_text('{"images": []}')
