@@ -263,6 +263,16 @@ def test_images_without_folders_of_splits_are_not_found_clean(root: Path) -> Non
         check_dataset(root / "flat")
 
 
+def test_pictures_of_16_bits_are_told_apart(root: Path) -> None:
+    """They were all white to it, and so the same picture in every split."""
+    for path in root.glob("images/*/*.jpg"):
+        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert grey is not None
+        cv2.imwrite(str(path.with_suffix(".png")), grey.astype(np.uint16) * 200 + 2000)
+        path.unlink()
+    assert check_dataset(root).findings == ()
+
+
 def test_coco_in_one_file_at_the_root_is_named(tmp_path: Path) -> None:
     (tmp_path / "empty.json").touch()
     (tmp_path / "notes.json").write_text('{"images": []}')

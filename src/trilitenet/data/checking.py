@@ -37,7 +37,7 @@ from trilitenet.data.reading import (
 from trilitenet.errors import DataError, few, import_extra
 from trilitenet.processing.boxes import best_side_ratio
 from trilitenet.processing.cores import ProcessPool
-from trilitenet.processing.images import BROKEN, open_image, upright_size
+from trilitenet.processing.images import BROKEN, open_image, read_image, upright_size
 
 __all__ = ["KINDS", "CheckReport", "Finding", "check_dataset", "detect_layout"]
 
@@ -392,7 +392,9 @@ def _look_at_image(
             size = upright_size(image)
             # JPEGs are decoded at 1/2, 1/4 or 1/8: a whole file is read, in a part of the time.
             image.draft("L", (64, 64))
-            grey = image.convert("L").resize((64, 64), Image.Resampling.BILINEAR)
+            # Pillow itself would cut off what is above 255 in 16 bits.
+            whole = Image.fromarray(read_image(image)) if image.mode[0] in "IF" else image
+            grey = whole.convert("L").resize((64, 64), Image.Resampling.BILINEAR)
     except BROKEN as error:
         faults.append(("image-unreadable", f"{where} ({_reason(error)})"))
         return None, digest, 0, b""
