@@ -240,6 +240,19 @@ def test_check_says_what_is_wrong(
         check(tmp_path)
 
 
+@pytest.mark.parametrize("fault", ["two endings", "broken index"])
+def test_a_page_tells_of_what_keeps_a_split_from_being_read(published: Path, tmp_path: Path, fault: str) -> None:
+    pytest.importorskip("imagehash")
+    if fault == "two endings":
+        cv2.imwrite(str(published / "images/train/train_0000.png"), np.zeros((72, 128, 3), np.uint8))
+    else:
+        (published / "index.csv").write_text("file,weather\n")
+    page = tmp_path / "report.html"
+    found = check(published, html=page, workers=1)
+    assert found.exit_code == 1
+    assert found.report.findings[0].kind in page.read_text()
+
+
 def test_show_sheets_and_pages(published: Path, tmp_path: Path) -> None:
     sheet = tmp_path / "sheets/all.png"
     assert show(published, sheet, count=4, columns=3, width=160).count == 8
