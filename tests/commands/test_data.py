@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import base64
 import errno
 import json
+import math
 import os
 import re
 import shutil
@@ -20,6 +22,8 @@ from trilitenet.apps.cli import main
 from trilitenet.commands import data as command
 from trilitenet.commands.data import _widths, check, convert, prepare, show
 from trilitenet.commands.train import training_data
+from trilitenet.data.check_page import check_page
+from trilitenet.data.checking import CheckReport
 from trilitenet.data.converting import ConversionOptions
 from trilitenet.data.description import DatasetDescription
 from trilitenet.data.prepared import PreparedDataset, open_dataset
@@ -251,6 +255,16 @@ def test_a_page_tells_of_what_keeps_a_split_from_being_read(published: Path, tmp
     found = check(published, html=page, workers=1)
     assert found.exit_code == 1
     assert found.report.findings[0].kind in page.read_text()
+
+
+def test_a_page_shows_more_pictures_than_one_jpeg_has_room_for() -> None:
+    sheet = np.zeros((65_600, 16, 3), np.uint8)
+    report = CheckReport(Path("data"), "", {}, {}, {}, {}, {}, {}, {}, math.nan, (), ())
+    page = check_page(report, sheet)
+    pictures = [
+        cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), 1) for data in re.findall(r'base64,([^"]+)', page)
+    ]
+    assert sum(len(picture) for picture in pictures if picture is not None) == len(sheet)
 
 
 def test_show_sheets_and_pages(published: Path, tmp_path: Path) -> None:

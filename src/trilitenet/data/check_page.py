@@ -25,9 +25,11 @@ table { border-collapse: collapse; } th, td { padding: .25rem .8rem .25rem 0; te
 border-bottom: 1px solid var(--line); } td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
 code { font-size: .85em; } .bad { color: var(--bad); font-weight: 600; } .good { color: var(--good); font-weight: 600; }
 .plots { display: flex; flex-wrap: wrap; gap: 1.5rem; } figure { margin: 0; } figcaption { font-size: .85rem; }
-img { max-width: 100%; } .scroll { overflow-x: auto; }
+img { display: block; max-width: 100%; } .scroll { overflow-x: auto; }
 svg text { font: 11px system-ui, sans-serif; fill: currentColor; }
 """
+_MOST_ROWS: Final = 65_000
+"""JPEG has no room for many more rows; of a higher picture it takes several, one below the other."""
 _SERIES: Final = ("var(--bar)", "var(--two)", "#009e73", "#cc79a7")
 
 
@@ -73,7 +75,8 @@ def check_page(report: CheckReport, sheet: NDArray[np.uint8] | None = None) -> s
         "</div>",
     ]
     if sheet is not None:
-        body += ["<h2>Some of it, with its labels</h2>", _image(sheet)]
+        parts = [sheet[top : top + _MOST_ROWS] for top in range(0, len(sheet), _MOST_ROWS)]
+        body += ["<h2>Some of it, with its labels</h2>", *map(_image, parts)]
     return _page(f"Check of {report.root.name}", body)
 
 
