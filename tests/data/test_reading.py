@@ -107,6 +107,16 @@ def test_categories_crowds_and_boxes_beyond_the_image(root: Path) -> None:
     assert len(two.ignored) == 2
 
 
+def test_a_category_to_ignore_is_ignored_though_a_class_has_it(root: Path) -> None:
+    """As the check and the conversion have it; trains are vehicles unless something is said."""
+    write_annotation(root, "train", "train_0000", [box("car", 0), box("train", 20)])
+    (root / "dataset.yaml").write_text("ignore: [train]\n")
+    sample = DrivingDataset(root, "train")[0]
+    assert sample.boxes is not None
+    assert sample.boxes[:, 0].tolist() == [0]
+    assert sample.ignored[:, 0].tolist() == [20]
+
+
 def test_index_gives_attributes(root: Path) -> None:
     (root / "index.csv").write_text(
         "name,split,source,condition\ntrain_0001,train,city,night\ntrain_0001,val,other,day\n"

@@ -55,7 +55,7 @@ class DatasetDescription:
     Attributes:
         name: What the data set is called.
         classes: Class name to the categories in the annotation files that belong to it, in the order of class ids.
-        ignore: Categories whose boxes are neither object nor background.
+        ignore: Categories whose boxes are neither object nor background, also where a class has them.
         splits: The splits there are; empty = whatever folders exist.
         tasks: Tasks that are labelled at all; the labels of others are left out.
         attributes: Names of the attributes each image carries.

@@ -153,7 +153,7 @@ def parse_annotation(
     Args:
         content: The parsed JSON.
         table: Category -> class id; other categories are left out.
-        ignore: Categories that are ignored regions.
+        ignore: Categories that are ignored regions, whether or not the table has them.
         size: (height, width) of the image; boxes are clipped to it and dropped when nothing is left.
         name: For messages.
 
@@ -174,14 +174,14 @@ def parse_annotation(
                 box = item.get("box2d")
                 if box is None:
                     continue
-                crowd = is_crowd(item) and category in table
-                if not crowd and category not in table and category not in ignore:
+                crowd = category in ignore or (is_crowd(item) and category in table)
+                if not crowd and category not in table:
                     continue
                 x1, y1 = max(float(box["x1"]), 0.0), max(float(box["y1"]), 0.0)
                 x2, y2 = min(float(box["x2"]), float(width)), min(float(box["y2"]), float(height))
                 if not (x2 > x1 and y2 > y1):
                     continue
-                if crowd or category not in table:
+                if crowd:
                     ignored.append((x1, y1, x2, y2))
                 else:
                     boxes.append((x1, y1, x2, y2))
