@@ -233,6 +233,7 @@ def test_mixed_data_sets(root: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(mixed[9].image, two[1].image)
     assert mixed.attributes(8) == two.attributes(0)
     assert mixed.weights.tolist() == [1.0] * 8 + [4.0] * 3
+    assert MixedDataset([(two, 1.0), (mixed, 0.5)]).weights.tolist() == [1.0] * 3 + [0.5] * 8 + [2.0] * 3
     weights = sampling_weights(mixed, {"timeofday": {"night": 2.0}})
     assert weights.tolist() == [1, 2, 1, 2, 1, 2, 1, 2, 4, 8, 4]
     with pytest.raises(IndexError):

@@ -445,8 +445,8 @@ class MixedDataset:
 
     @property
     def weights(self) -> NDArray[np.float64]:
-        """(N,) float64: the weight of each sample."""
-        return np.concatenate([np.full(len(dataset), weight, np.float64) for dataset, weight in self.parts])
+        """(N,) float64: the weight of each sample, by those within a part that is mixed itself."""
+        return np.concatenate([weight * _weights_within(dataset) for dataset, weight in self.parts])
 
     def __len__(self) -> int:
         return int(self._ends[-1])
@@ -465,6 +465,11 @@ class MixedDataset:
             raise IndexError(index)
         part = int(np.searchsorted(self._ends, index, side="right"))
         return self.parts[part][0], index - (int(self._ends[part - 1]) if part else 0)
+
+
+def _weights_within(dataset: SampleSource) -> NDArray[np.float64]:
+    """Return (N,) float64: how often each of a data set's samples is drawn against the others."""
+    return dataset.weights if isinstance(dataset, MixedDataset) else np.ones(len(dataset), np.float64)
 
 
 def sampling_weights(
@@ -486,7 +491,7 @@ def sampling_weights(
     Raises:
         DataError: If a factor is negative or infinite, or all weights are 0.
     """
-    weights = dataset.weights if isinstance(dataset, MixedDataset) else np.ones(len(dataset), np.float64)
+    weights = _weights_within(dataset)
     for attribute, factors in table.items():
         for value, factor in factors.items():
             if not 0 <= factor < math.inf:
