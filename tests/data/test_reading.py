@@ -126,6 +126,9 @@ def test_index_gives_attributes(root: Path) -> None:
     assert dataset[1].attributes == dataset.attributes(1)
     (root / "index.csv").write_text("name,split,source\ntrain_0001,train,straße\n", encoding="utf-8-sig")
     assert DrivingDataset(root, "train").attributes(1)["source"] == "straße"
+    (root / "index.csv").write_text("name,split,weather,\ntrain_0000,train,rain,more,yet more\n")  # as spreadsheets do
+    assert DrivingDataset(root, "train")[0].attributes[""] == "more"
+    assert sampling_weights(DrivingDataset(root, "train"), {"weather": {"rain": 2.0}})[0] == 2.0
     (root / "index.csv").write_bytes("name,split\nstraße,train\n".encode("latin-1"))
     with pytest.raises(DataError, match=r"index\.csv: cannot be read as CSV in UTF-8"):
         DrivingDataset(root, "train")
