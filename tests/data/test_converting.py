@@ -379,6 +379,16 @@ def test_mask_pictures_of_every_depth(tmp_path: Path, mode: str, values: dict[in
     np.testing.assert_array_equal(DrivingDataset(tmp_path / "out", "train")[0].lane, truth)
 
 
+def test_a_level_beyond_all_colours_has_no_meaning(tmp_path: Path) -> None:
+    levels = np.array([[7, 7, -1, 1 << 24, 0, 3, 0x7FFFFFFF, 7]] * 6, np.int32)
+    Image.fromarray(levels).save(tmp_path / "mask.tif")
+    record = picture(tmp_path / "raw/a.png", lane=MaskFile(tmp_path / "mask.tif", {7: "foreground", 0: "background"}))
+    report = convert(Records(train=[record]), tmp_path / "out")
+    lane = DrivingDataset(tmp_path / "out", "train")[0].lane
+    np.testing.assert_array_equal(lane, levels == 7)
+    assert report.dropped["train"] == {"lane: values of a mask that nothing explains": 1}
+
+
 def test_gaps_and_widths_are_those_of_an_image_1280_pixels_wide() -> None:
     y = np.arange(100.0, 341.0, 20.0)
     edges = [LaneLabel("single white", np.stack([np.full_like(y, x), y], axis=1), edge=True) for x in (300.0, 330.0)]

@@ -72,6 +72,9 @@ ALTERNATIVE_VALUE: Final = 127
 IGNORE_VALUE: Final = 64
 """Mask value of pixels that are neither foreground nor background."""
 
+_BACKGROUND: Final = 1
+"""Stands for 0 while 0 stands for values without a meaning."""
+
 _CORNERS: Final = 3
 """An area with fewer has no pixel."""
 
@@ -473,11 +476,11 @@ def _mask_of(file: MaskFile, size: tuple[int, int], *, keep_alternative: bool) -
             picture.load()
             colours = any(isinstance(value, tuple) for value in file.values)
             if colours or (not file.values and picture.mode.startswith("RGB")):
-                rgb = np.asarray(picture.convert("RGB")).astype(np.int64)
+                rgb = np.asarray(picture.convert("RGB")).astype(np.int32)
                 pixels = (rgb[..., 0] << 16) | (rgb[..., 1] << 8) | rgb[..., 2]
             else:
                 plain = picture if picture.mode in {"P", "L", "1"} or picture.mode[0] == "I" else picture.convert("L")
-                pixels = np.asarray(plain).astype(np.int64)
+                pixels = np.asarray(plain).astype(np.int32)
                 if picture.mode == "1" and 1 not in file.values:
                     pixels *= 255  # a picture of two levels has them as 0 and 255 everywhere else
     except BROKEN as error:
@@ -486,15 +489,16 @@ def _mask_of(file: MaskFile, size: tuple[int, int], *, keep_alternative: bool) -
         raise DataError(f"{file.path}: mask of {pixels.shape[1]}x{pixels.shape[0]}, image of {size[1]}x{size[0]}")
     if not file.values:
         return np.where(pixels > 0, 255, 0).astype(np.uint8), False
-    mask = np.zeros(size, np.uint8)
-    known = np.zeros(size, np.bool_)
+    table = np.zeros(1 << 24, np.uint8)  # of all colours; a level beyond is told by the last, which is none's
     for value, meaning in file.values.items():
-        where = pixels == ((value[0] << 16) | (value[1] << 8) | value[2] if isinstance(value, tuple) else value)
-        known |= where
-        if meaning != "background":
-            mask[where] = _level(meaning, keep_alternative=keep_alternative)
+        place = (value[0] << 16) | (value[1] << 8) | value[2] if isinstance(value, tuple) else value
+        background = meaning == "background"
+        table[place] = _BACKGROUND if background else _level(meaning, keep_alternative=keep_alternative)
+    mask = table[np.clip(pixels, -1, len(table) - 1)]
+    unknown = mask == 0
+    mask[mask == _BACKGROUND] = 0
     complete = "background" in file.values.values()
-    return mask, bool((complete or not known.any()) and (pixels[~known] != 0).any())
+    return mask, bool((complete or unknown.all()) and (pixels[unknown] != 0).any())
 
 
 def _write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
