@@ -161,16 +161,16 @@ def _feet(points: NDArray[np.float64], line: NDArray[np.float64]) -> tuple[NDArr
     """Return the nearest point on ``line`` to each point, and whether it is not just an end that the point is past."""
     start, along = line[:-1], np.diff(line, axis=0)
     length = np.maximum((along**2).sum(axis=1), 1e-12)
-    offset = points[:, None] - start
-    run = (offset * along).sum(axis=2) / length
+    # Axis by axis: sums over two numbers would take most of the time.
+    x, y = points[:, None, 0] - start[:, 0], points[:, None, 1] - start[:, 1]
+    run = (x * along[:, 0] + y * along[:, 1]) / length
     clipped = np.clip(run, 0, 1)
-    feet = start + clipped[..., None] * along
-    nearest = ((points[:, None] - feet) ** 2).sum(axis=2).argmin(axis=1)
+    nearest = ((x - clipped * along[:, 0]) ** 2 + (y - clipped * along[:, 1]) ** 2).argmin(axis=1)
     rows = np.arange(len(points))
     chosen = run[rows, nearest]
     slack = 1e-6
     past = ((nearest == 0) & (chosen < -slack)) | ((nearest == len(start) - 1) & (chosen > 1 + slack))
-    return feet[rows, nearest], ~past
+    return start[nearest] + clipped[rows, nearest, None] * along[nearest], ~past
 
 
 def _boxes_apart(one: NDArray[np.float64], two: NDArray[np.float64], gap: float) -> bool:

@@ -7,7 +7,6 @@ pixels that a shape's edge merely touches, which makes areas a pixel larger and 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,6 +18,12 @@ __all__ = ["check_finite", "draw_line", "fill_polygon", "flatten"]
 
 _STEP = 2.0
 """A curve is sampled about every so many pixels."""
+
+_PIECE = 16.0
+"""A line is drawn in pieces of at most so many pixels."""
+
+_TOGETHER = 1 << 17
+"""Pixels that are looked at at once."""
 
 _FARTHEST = 30_000.0
 """No image is so many pixels wide or high; a line that long would take hours, or all memory."""
@@ -129,31 +134,41 @@ def draw_line(mask: NDArray[np.uint8], points: NDArray[np.float64], width: float
     radius = width / 2
     if len(points) == 1:
         points = np.repeat(points, 2, axis=0)
-    for start, end in itertools.pairwise(points):
-        # Long segments go in pieces, so that the boxes looked at stay small.
-        pieces = max(1, int(np.ceil(np.abs(end - start).max() / 48)))
-        stops = start + (end - start) * np.linspace(0, 1, pieces + 1)[:, None]
-        for one, two in itertools.pairwise(stops):
-            _draw_segment(mask, one, two, radius, value)
+    # Long segments go in pieces, so that the boxes looked at stay small.
+    steps = np.diff(points, axis=0)
+    counts = np.maximum(np.ceil(np.abs(steps).max(axis=1) / _PIECE), 1).astype(np.int64)
+    along = np.repeat(steps / counts[:, None], counts, axis=0)
+    number = np.arange(len(along)) - np.repeat(np.cumsum(counts) - counts, counts)
+    start = np.repeat(points[:-1], counts, axis=0) + number[:, None] * along
+    corner = np.floor(np.minimum(start, start + along) - radius - 0.5)
+    side = int(np.ceil(np.abs(along).max(initial=0) + width)) + 3
+    seen = ((corner < mask.shape[::-1]) & (corner > -side)).all(axis=1)
+    start, along, corner = start[seen], along[seen], corner[seen]
+    together = max(1, _TOGETHER // side**2)
+    for first in range(0, len(start), together):
+        part = slice(first, first + together)
+        _draw_pieces(mask, start[part], along[part], corner[part], side, radius, value)
 
 
-def _draw_segment(
-    mask: NDArray[np.uint8], start: NDArray[np.float64], end: NDArray[np.float64], radius: float, value: int
+def _draw_pieces(
+    mask: NDArray[np.uint8],
+    start: NDArray[np.float64],
+    along: NDArray[np.float64],
+    corner: NDArray[np.float64],
+    side: int,
+    radius: float,
+    value: int,
 ) -> None:
-    height, width = mask.shape
-    low = np.floor(np.minimum(start, end) - radius - 0.5).astype(np.int64)
-    high = np.ceil(np.maximum(start, end) + radius + 0.5).astype(np.int64)
-    left, top = np.clip(low, 0, (width, height))
-    right, bottom = np.clip(high, 0, (width, height))
-    if left >= right or top >= bottom:
-        return
-    x = np.arange(left, right) + 0.5 - start[0]
-    y = (np.arange(top, bottom) + 0.5 - start[1])[:, None]
-    along = end - start
-    length = float(along @ along)
-    run = np.clip((x * along[0] + y * along[1]) / length, 0, 1) if length else np.zeros((1, 1))
-    near = (x - run * along[0]) ** 2 + (y - run * along[1]) ** 2 <= radius * radius + 1e-9
-    mask[top:bottom, left:right][near] = value
+    """Draw pieces of a line, each within a square of ``side`` pixels from its ``corner`` on; all arrays are (N, 2)."""
+    columns, rows = (corner[:, axis, None].astype(np.int64) + np.arange(side) for axis in (0, 1))
+    x, y = (columns + 0.5 - start[:, :1])[:, None, :], (rows + 0.5 - start[:, 1:])[:, :, None]
+    along_x, along_y = along[:, 0, None, None], along[:, 1, None, None]
+    length = along_x**2 + along_y**2
+    run = np.clip((x * along_x + y * along_y) / np.where(length > 0, length, 1), 0, 1)
+    near = (x - run * along_x) ** 2 + (y - run * along_y) ** 2 <= radius * radius + 1e-9
+    near &= ((rows >= 0) & (rows < mask.shape[0]))[:, :, None] & ((columns >= 0) & (columns < mask.shape[1]))[:, None]
+    piece, row, column = np.nonzero(near)
+    mask[rows[piece, row], columns[piece, column]] = value
 
 
 def _bezier(control: NDArray[np.float64]) -> NDArray[np.float64]:
