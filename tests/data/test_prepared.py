@@ -110,6 +110,9 @@ def test_a_data_set_uses_its_prepared_copy_by_itself(root: Path, caplog: pytest.
     with caplog.at_level(logging.WARNING):
         assert isinstance(open_dataset(root, "train", canvas=CANVAS, mask_above=64), DrivingDataset)
     assert "prepared with --mask-above 1 and not used, as 64 is wanted" in caplog.text
+    for name in ("images/train/.DS_Store", "images/train/Thumbs.db", "det_annotations/train/._train_0000.json"):
+        (root / name).touch()  # by looking at the folder
+    assert isinstance(open_dataset(root, "train", canvas=CANVAS), PreparedDataset)
     path = root / "da_seg_annotations/train/train_0000.png"
     path.unlink()
     with caplog.at_level(logging.WARNING):

@@ -637,9 +637,15 @@ def _read_state(folder: Path) -> dict[str, Any]:
 
 
 def _files_of(root: Path, split: str) -> Iterator[str]:
+    """Yield the files that are read, not such as ``.DS_Store`` and ``Thumbs.db``, which looking at a folder makes."""
     for folder in FOLDERS:
         if (root / folder / split).is_dir():
-            yield from (f"{folder}/{split}/{path.name}" for path in (root / folder / split).iterdir())
+            names = (path.name for path in (root / folder / split).iterdir())
+            yield from (
+                f"{folder}/{split}/{name}"
+                for name in names
+                if is_image_file(name) or (name.endswith(".json") and not name.startswith("."))
+            )
     yield from _common_files(root)
 
 
