@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from tests.data.published import write_annotation, write_published
+from trilitenet.data.identity import identify, tell_apart
 from trilitenet.data.loader import build_loader
 from trilitenet.data.prepared import PreparedDataset, open_dataset, prepare
 from trilitenet.data.reading import DrivingDataset
@@ -143,6 +144,15 @@ def test_twice_changes_nothing_and_changes_are_seen(root: Path, tmp_path: Path) 
     drivable = packed[4].drivable
     assert drivable is not None
     assert not drivable.any()
+
+
+def test_prepared_from_files_of_another_day_it_is_the_same_data(root: Path, tmp_path: Path) -> None:
+    prepare(root, tmp_path / "one", canvas=CANVAS)
+    for path in root.glob("*/train/*"):
+        os.utime(path, (10**9, 10**9))  # as by a copy to another machine
+    prepare(root, tmp_path / "two", canvas=CANVAS)
+    one, two = (identify(PreparedDataset(tmp_path / name, "train")) for name in ("one", "two"))
+    assert tell_apart(one, two, strict=True) is None
 
 
 def describe(root: Path, text: str) -> None:

@@ -326,7 +326,9 @@ class PreparedDataset:
 
     def fingerprint(self, index: int) -> str:
         """Return a hash of what the shard's index says of a sample: boxes, attributes, and the size of its parts."""
-        return hashlib.sha256(self._lines[index]).hexdigest()[:16]
+        entry = self._entry(index)
+        entry.pop("made_from", None)  # when the files of the shard were written, which a copy of them is not
+        return hashlib.sha256(json.dumps(entry).encode()).hexdigest()[:16]
 
     def _entry(self, index: int) -> dict[str, Any]:
         return _parse_entry(self._lines[index], _index_name(self._shards[self._shard_of[index]]))
