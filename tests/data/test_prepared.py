@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
 import os
@@ -20,7 +21,7 @@ from trilitenet.data.prepared import PreparedDataset, open_dataset, prepare
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.sample import VALID
 from trilitenet.data.transforms import TrainTransform
-from trilitenet.errors import ConfigError, DataError, OutputError
+from trilitenet.errors import Claim, ConfigError, DataError, OutputError
 
 CANVAS = (64, 96)
 
@@ -153,6 +154,18 @@ def test_prepared_from_files_of_another_day_it_is_the_same_data(root: Path, tmp_
     prepare(root, tmp_path / "two", canvas=CANVAS)
     one, two = (identify(PreparedDataset(tmp_path / name, "train")) for name in ("one", "two"))
     assert tell_apart(one, two, strict=True) is None
+
+
+def test_two_at_once_are_kept_apart(root: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    prepare(root, out, canvas=CANVAS)
+    part = out / ".train-000000.tar.0a1b2c3d.part"
+    part.touch()  # of the other
+    with contextlib.closing(Claim(out / "prepared.json")), pytest.raises(OutputError, match="is being written already"):
+        prepare(root, out, canvas=CANVAS)
+    assert part.exists()
+    prepare(root, out, canvas=CANVAS)
+    assert not list(out.glob("*.part"))
 
 
 def describe(root: Path, text: str) -> None:

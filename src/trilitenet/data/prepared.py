@@ -47,7 +47,7 @@ from trilitenet.data.reading import (
     label_file,
 )
 from trilitenet.data.sample import BOXES, MASKS, VALID, Sample
-from trilitenet.errors import ConfigError, DataError, OutputError, import_extra, replacing, writing
+from trilitenet.errors import Claim, ConfigError, DataError, OutputError, import_extra, replacing, writing
 from trilitenet.processing.cores import ProcessPool
 from trilitenet.processing.letterbox import Letterbox
 
@@ -137,7 +137,7 @@ def prepare(
 
     Raises:
         ConfigError: If a number is out of range.
-        OutputError: If ``out`` holds something else, or was made with other settings.
+        OutputError: If ``out`` holds something else, was made with other settings, or is being written by another call.
         DataError: If the data set is broken, or no box is of one of the ``class_names`` that are given.
     """
     root = Path(root)
@@ -163,8 +163,6 @@ def prepare(
     else:
         for dataset in datasets.values():
             dataset.warn_of_foreign()
-    with writing(out):
-        _open_out(plan)
     jobs = [
         (split, number, dataset.names[first : first + shard_size])
         for split, dataset in datasets.items()
@@ -173,6 +171,10 @@ def prepare(
     total = sum(map(len, datasets.values()))
     done = 0
     with writing(out):
+        _open_out(plan)
+    with writing(out), contextlib.closing(Claim(out / PREPARED_FILE)):
+        for part in out.glob(".*.part"):  # of a run that was killed
+            part.unlink()
         _forget(plan, datasets)
         for count in _run_jobs(plan, jobs, workers):
             done += count
@@ -583,8 +585,6 @@ def _open_out(plan: _Plan) -> None:
     elif plan.out.is_dir() and any(plan.out.iterdir()):
         raise OutputError(f"{plan.out}: is not empty and not prepared earlier; choose another folder")
     plan.out.mkdir(parents=True, exist_ok=True)
-    for part in plan.out.glob(".*.part"):  # of a run that was killed
-        part.unlink()
     if not state.is_file():
         _replace_state(plan, {"splits": {}, "shards": {}, "counts": {}})
 
