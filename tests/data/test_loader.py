@@ -218,7 +218,11 @@ def test_settings_are_checked(dataset: DrivingDataset) -> None:
         build_loader(dataset, EvalTransform(CANVAS), batch_size=0)
     with pytest.raises(ConfigError, match="needs shuffle"):
         build_loader(dataset, EvalTransform(CANVAS), batch_size=1, shuffle=False, samples_per_epoch=4)
-    for weights in (np.ones(3), np.zeros(14), -np.ones(14)):
+    with pytest.raises(ConfigError, match="seed at least 0, got 1, 0 and -1"):
+        build_loader(dataset, EvalTransform(CANVAS), batch_size=1, seed=-1)
+    with pytest.raises(ConfigError, match="no sample"):
+        build_loader(DrivingDataset(dataset.root, "train", names=[]), EvalTransform(CANVAS), batch_size=1)
+    for weights in (np.ones(3), np.zeros(14), -np.ones(14), np.full(14, np.inf), np.full(14, np.nan)):
         with pytest.raises(ConfigError, match="weights must be 14"):
             build_loader(dataset, EvalTransform(CANVAS), batch_size=1, weights=weights)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import multiprocessing
 import os
 import signal
@@ -271,10 +272,14 @@ def build_loader(
             together they see what one process would. ``batch_size`` is that of all together.
 
     Raises:
-        ConfigError: If a number is out of range, or the weights do not fit the data set.
+        ConfigError: If a number is out of range, the weights do not fit the data set, or it is empty.
     """
-    if batch_size < 1 or workers < 0:
-        raise ConfigError(f"batch_size must be at least 1 and workers 0, got {batch_size} and {workers}")
+    if not len(dataset):
+        raise ConfigError("there is no sample to load")
+    if batch_size < 1 or workers < 0 or seed < 0:
+        raise ConfigError(
+            f"batch_size must be at least 1, workers and seed at least 0, got {batch_size}, {workers} and {seed}"
+        )
     if not 0 <= share[0] < share[1] or batch_size % share[1]:
         raise ConfigError(f"a batch of {batch_size} cannot be shared by {share[1]} processes in equal parts")
     if samples_per_epoch is not None and (samples_per_epoch < 1 or not shuffle):
@@ -282,8 +287,10 @@ def build_loader(
     if weights is None and isinstance(dataset, MixedDataset):
         own = dataset.weights
         weights = None if (own == own[0]).all() else own
-    if weights is not None and (weights.shape != (len(dataset),) or not (weights >= 0).all() or not weights.any()):
-        raise ConfigError(f"weights must be {len(dataset)} numbers, none negative and one above 0")
+    if weights is not None and (
+        weights.shape != (len(dataset),) or not (weights >= 0).all() or not 0 < weights.sum() < math.inf
+    ):
+        raise ConfigError(f"weights must be {len(dataset)} numbers, none negative, one above 0 and none infinite")
     length = samples_per_epoch or len(dataset)
     drop_last = shuffle and length >= batch_size
     rest = length % batch_size
