@@ -132,6 +132,19 @@ def test_uncertainty_weighting_learns_nothing_of_boxes_that_nobody_labelled() ->
     assert (parameter.grad[1:] != 0).all()
 
 
+def test_uncertainty_weighting_learns_nothing_of_a_task_without_weight() -> None:
+    outputs, batch = case()
+    for task in range(3):
+        weights = tuple(0.0 if index == task else 1.0 for index in range(3))
+        loss = MultiTaskLoss(
+            DetectionLoss(ANCHORS, 1), weights=(weights[0], weights[1], weights[2]), balancing="uncertainty"
+        )
+        loss(outputs, batch).total.backward()
+        (parameter,) = loss.parameters()
+        assert parameter.grad is not None
+        assert (parameter.grad != 0).tolist() == [index != task for index in range(3)]
+
+
 def test_a_balancing_that_is_none_is_refused() -> None:
     with pytest.raises(ConfigError, match="unknown balancing 'learned'; known: fixed, uncertainty"):
         MultiTaskLoss(None, balancing="learned")  # type: ignore[arg-type]

@@ -120,20 +120,20 @@ class MultiTaskLoss(nn.Module):
         extra = zero
         if self.log_variance is not None:
             weights = [weight * torch.exp(-s) for weight, s in zip(self.weights, self.log_variance, strict=True)]
-            extra = (self.log_variance * self._labelled(outputs, batch)).sum()
+            extra = (self.log_variance * self._learning(outputs, batch)).sum()
         task = (0, 0, 0, 1, 1, 2, 2)
         parts = [term * weights[index] for term, index in zip(terms, task, strict=True)]
         total = torch.stack(parts).sum() + extra
         return LossTerms(total, *parts)
 
-    def _labelled(self, outputs: Outputs, batch: Targets) -> Tensor:
-        """Return (3,) bool: the tasks that the batch has a label of; the weights of the others learn nothing."""
+    def _learning(self, outputs: Outputs, batch: Targets) -> Tensor:
+        """Return (3,) bool: the tasks of a weight above 0 that the batch has a label of; the others learn nothing."""
         missing = torch.zeros((), dtype=torch.bool, device=batch.detection_labelled.device)
         has_boxes = outputs.detection is not None and self.detection is not None
         return torch.stack(
             [
-                batch.detection_labelled.any() if has_boxes else missing,
-                missing if outputs.drivable is None else (batch.drivable != IGNORED).any(),
-                missing if outputs.lane is None else (batch.lane != IGNORED).any(),
+                batch.detection_labelled.any() if has_boxes and self.weights[0] else missing,
+                (batch.drivable != IGNORED).any() if outputs.drivable is not None and self.weights[1] else missing,
+                (batch.lane != IGNORED).any() if outputs.lane is not None and self.weights[2] else missing,
             ]
         )
