@@ -500,6 +500,23 @@ def test_thresholds_of_what_a_network_has_not_or_never_finds_stay() -> None:
     assert np.isnan(best.detection_f1)
 
 
+def test_thresholds_stay_where_nothing_is_ever_right() -> None:
+    images = Images(2)
+    predictor = fake_predictor(images)
+    find = predictor.backend.run
+
+    def err(batch: np.ndarray) -> RawOutputs:
+        raw = find(batch)
+        assert raw.detection is not None and raw.drivable is not None and raw.lane is not None  # noqa: PT018
+        raw.detection[..., :4] = (2, 2, 4, 4)
+        return RawOutputs(raw.detection, 255 - raw.drivable, 255 - raw.lane)
+
+    predictor.backend.run = err  # type: ignore[method-assign]
+    best = best_thresholds(predictor, images)
+    assert best.thresholds == predictor.thresholds
+    assert (best.detection_f1, best.drivable_iou, best.lane_iou) == (0.0, 0.0, 0.0)
+
+
 def test_each_mask_has_its_own_threshold() -> None:
     images = Images(3)
     predictor = fake_predictor(images)

@@ -474,13 +474,13 @@ def _best_cut(counts: NDArray[np.int64], default: float) -> tuple[float, float]:
         return default, float("nan")
     iou = above[1, 1:] / (total + above[0, 1:])
     best = int(iou.argmax()) + 1  # foreground from this value up
-    return round((best - 0.5) / 255, 4), float(iou[best - 1])
+    return round((best - 0.5) / 255, 4) if iou[best - 1] else default, float(iou[best - 1])
 
 
 def _best_confidence(detection: DetectionMetric, default: float) -> tuple[float, float]:
     curve, best = detection.curve(), detection.compute().best
-    if np.isnan(best.f1):
-        return default, float("nan")
+    if not best.f1 > 0:  # undefined, or no box is right at any confidence
+        return default, best.f1
     at = int(np.flatnonzero(curve.confidence == best.confidence)[0])
     below = curve.confidence[at + 1] if at + 1 < len(curve.confidence) else 0.0
     return round(float((best.confidence + below) / 2), 6), best.f1
