@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -40,6 +42,19 @@ def test_masks_are_coloured_by_what_is_right_false_and_missed() -> None:
     assert not small.any()  # the caller's picture stays
     for column, colour in ((60, FALSE), (200, RIGHT), (300, MISSED), (400, (0, 0, 0))):
         np.testing.assert_allclose(picture[120, column], np.array(colour) / 2, atol=8)
+
+
+def test_pixels_that_do_not_count_are_neither_false_nor_missed() -> None:
+    black = np.zeros((720, 1280, 3), np.uint8)
+    whole, left = np.ones((720, 1280), np.bool_), np.ones((720, 1280), np.bool_)
+    left[:, 640:] = False
+    sample = Sample(name="a", image=black, drivable=whole.astype(np.uint8), lane=~whole * np.uint8(1), lane_valid=left)
+    sample = dataclasses.replace(sample, drivable_valid=left)
+    seen = _perception(drivable=~whole, lane=whole)
+    for task, colour, opacity in (("drivable", MISSED, 0.5), ("lane", FALSE, 0.85)):
+        picture = _decoded(error_overlay(shrunken(black), sample, seen, task, confidence=0.25))  # type: ignore[arg-type]
+        np.testing.assert_allclose(picture[120, 100], np.array(colour) * opacity, atol=8)
+        assert picture[120, 240:].max() < 8
 
 
 @pytest.mark.parametrize("column", range(600, 606))

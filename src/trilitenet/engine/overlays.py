@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from trilitenet.config import Task
 from trilitenet.engine.scoring import LabelledImage, on_own_car
 from trilitenet.metrics.detection import in_regions, match_boxes
+from trilitenet.metrics.segmentation import as_binary
 from trilitenet.structures import Boxes, Perception
 
 __all__ = ["FALSE", "IGNORED", "MISSED", "RIGHT", "error_overlay", "shrunken"]
@@ -69,7 +70,8 @@ def error_overlay(
     else:
         predicted, true = getattr(prediction, task), getattr(sample, task)
         if predicted is not None and true is not None:
-            _draw_masks(picture, predicted, true, thick=task == "lane")
+            counted = sample.counted(task)
+            _draw_masks(picture, as_binary(predicted, counted), as_binary(true, counted), thick=task == "lane")
     encoded = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     return bytes(np.asarray(encoded, np.uint8))
 
@@ -77,14 +79,10 @@ def error_overlay(
 _BY_PREDICTED_AND_TRUE: Final = np.array([(0, 0, 0), FALSE, MISSED, RIGHT], np.uint8)
 
 
-def _draw_masks(picture: NDArray[np.uint8], predicted: NDArray[Any], true: NDArray[Any], thick: bool) -> None:
+def _draw_masks(picture: NDArray[np.uint8], predicted: NDArray[np.uint8], true: NDArray[np.uint8], thick: bool) -> None:
     # Thin lines survive the shrinking when any share of a pixel counts.
     limit, opacity = (40, 0.85) if thick else (127, 0.5)
-    first, second = (
-        _shrink(np.asarray(cv2.compare(np.asarray(mask, np.uint8), 0, cv2.CMP_GT), np.uint8), picture.shape[1::-1])
-        > limit
-        for mask in (predicted, true)
-    )
+    first, second = (_shrink(mask * np.uint8(255), picture.shape[1::-1]) > limit for mask in (predicted, true))
     which = first.view(np.uint8) + 2 * second.view(np.uint8)
     coloured = cv2.addWeighted(picture, 1 - opacity, _BY_PREDICTED_AND_TRUE[which], opacity, 0)
     cv2.copyTo(coloured, which, picture)
