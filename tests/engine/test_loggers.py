@@ -45,6 +45,12 @@ def test_a_line_that_was_cut_off_is_left_out(tmp_path: Path) -> None:
         assert read_csv(path) == [(4, "loss", 2.0), (8, "loss", 1.0)]
 
 
+def test_zero_bytes_that_a_machine_left_as_it_went_down_are_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.csv"
+    path.write_bytes(b"step,name,value\n4,loss,2.0\n" + bytes(64) + b"8,loss,1.0\n" + bytes(64))
+    assert read_csv(path) == [(4, "loss", 2.0), (8, "loss", 1.0)]
+
+
 def test_a_new_run_starts_the_file_anew(tmp_path: Path) -> None:
     for _ in range(2):
         logger = CsvLogger(tmp_path / "m.csv")

@@ -65,7 +65,8 @@ def read_csv(path: Path) -> list[tuple[int, str, float]]:
     """Return the (step, name, value) rows that `CsvLogger` wrote, without a line that a full disk or a kill cut off."""
     rows: list[tuple[int, str, float]] = []
     with path.open(newline="", encoding="utf-8", errors="replace") as file:
-        for row in csv.DictReader(file):
+        # A machine that goes down may leave zero bytes, at which Python 3.10 raises csv.Error.
+        for row in csv.DictReader(line.replace("\0", "") for line in file):
             with contextlib.suppress(TypeError, ValueError, KeyError):
                 rows.append((int(row["step"]), row["name"], float(row["value"])))
     return rows
