@@ -16,7 +16,7 @@ from trilitenet.engine.evaluate import evaluate
 from trilitenet.engine.figures import FIGURES
 from trilitenet.engine.page import percent
 from trilitenet.engine.published_rows import PUBLISHED_ROWS
-from trilitenet.engine.report import SAVED, Report, read_report
+from trilitenet.engine.report import SAVED, Figure, Report, read_report
 from trilitenet.engine.robustness import CORRUPTED, corrupted_figures, figures_by_size
 from trilitenet.errors import ConfigError, DataError, OutputError
 from trilitenet.processing.letterbox import Letterbox
@@ -277,6 +277,19 @@ def test_input_sizes_are_swept(tmp_path: Path) -> None:
 def test_undefined_figures_are_a_dash() -> None:
     assert percent(float("nan")) == percent(None) == "-"
     assert percent(np.float64(0.1234)) == "12.3"
+
+
+def test_undefined_figures_have_neither_interval_nor_verdict(tmp_path: Path) -> None:
+    images = Images(3)
+    images._samples = [dataclasses.replace(sample, drivable=None) for sample in images._samples]
+    report = evaluate(fake_predictor(images), images, protocol="both", resamples=10)
+    assert (Figure(0.5, 0.25, 0.75).spread, Figure(0.5).spread) == ("25.0 to 75.0", "")
+    report.save_html(tmp_path / "report.html")
+    comparison = compare_reports({"a": report, "b": report}, resamples=10)
+    comparison.save(tmp_path)
+    assert {one.figure.split("/")[1] for one in comparison.differences} == {"detection", "lane"}
+    pages = [(tmp_path / f"{name}.html").read_text() for name in ("report", "comparison")]
+    assert not any("- to -" in text for text in (report.summary(), comparison.summary(), *pages))
 
 
 def test_every_image_has_noise_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:

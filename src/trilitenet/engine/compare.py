@@ -60,7 +60,8 @@ class Comparison:
         names: Of the models; the first is what others are compared with.
         data: Where each was measured.
         figures: Name -> figure key -> value.
-        differences: Of every other model to the first; none for those measured on other images.
+        differences: Of every other model to the first; none for those measured on other images, nor of a figure that is
+            undefined for either.
         unpaired: Name -> why its differences, or some of them, cannot be told.
         confidence: Name -> the confidence that precision, recall and F1 of boxes are stated at.
         published: Published rows beside them.
@@ -164,9 +165,9 @@ def compare_reports(
         for key, figure in other.figures.items():
             if any(part in key for part in reasons):
                 continue
-            if key in first.figures and key in spread and key in base:
+            value = figure.value - first.figures[key].value if key in first.figures else math.nan
+            if not math.isnan(value) and key in spread and key in base:
                 low, high = interval(spread[key] - base[key])
-                value = figure.value - first.figures[key].value
                 differences.append(Difference(name, key, value, low, high, bool(low > 0 or high < 0)))
     return Comparison(
         names=names,
@@ -289,7 +290,7 @@ def _comparison_page(comparison: Comparison) -> str:
         body = (
             interval_plot(rows, f"differences of {name} to {names[0]}, points of a per cent")
             if rows
-            else f'<p class="note">{escape(comparison.unpaired.get(name, "no figure in common"))}</p>'
+            else f'<p class="note">{escape(comparison.unpaired.get(name, "no difference to tell"))}</p>'
         )
         plots.append(f'<div class="card"><h3>{escape(name)} less {escape(names[0])}, points</h3>{body}</div>')
     if note := comparison.confidence_note():

@@ -50,13 +50,20 @@ class Figure:
 
     Attributes:
         value: In [0, 1]; NaN where undefined.
-        low: Lower end; None without resampling.
-        high: Upper end; None without resampling.
+        low: Lower end; None without resampling, NaN where undefined.
+        high: Upper end; likewise.
     """
 
     value: float
     low: float | None = None
     high: float | None = None
+
+    @property
+    def spread(self) -> str:
+        """The interval in per cent, in words; empty without one, as where the value is undefined."""
+        if self.low is None or math.isnan(self.low):
+            return ""
+        return f"{percent(self.low)} to {percent(self.high)}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -305,9 +312,8 @@ def _figure_table(protocol: str, figures: Mapping[str, Figure]) -> Table:
         owner, task, _ = key.split("/")
         if owner != protocol:
             continue
-        interval = "" if figure.low is None else f"{percent(figure.low)} to {percent(figure.high)}"
         words = meaning(key)
-        table.add_row(task if task != last else "", words.title, percent(figure.value), interval, words.formula)
+        table.add_row(task if task != last else "", words.title, percent(figure.value), figure.spread, words.formula)
         last = task
     return table
 

@@ -52,10 +52,9 @@ def _tiles(report: Report) -> str:
             figure = report.figures.get(key)
             if figure is None or not key.startswith(f"{protocol}/"):
                 continue
-            spread = "" if figure.low is None else f"{percent(figure.low)} to {percent(figure.high)}"
             tiles.append(
                 f'<div class="tile"><span>{key.split("/")[1]}</span><b>{percent(figure.value)}</b>'
-                f"<span>{escape(meaning(key).title)}</span><span>{spread}</span></div>"
+                f"<span>{escape(meaning(key).title)}</span><span>{figure.spread}</span></div>"
             )
         groups.append(f'<h3>{protocol} protocol</h3><div class="tiles">{"".join(tiles)}</div>')
     return "".join(groups)
@@ -72,10 +71,9 @@ def _figures(report: Report, protocol: str) -> str:
             rows.append(f'<tr><th colspan="2" class="group">{task}</th></tr>')
             last = task
         words = meaning(key)
-        spread = "" if figure.low is None else f"{percent(figure.low)} to {percent(figure.high)}"
         rows.append(
             f'<tr><td>{escape(words.title)}<span class="note">{escape(words.formula)}</span></td>'
-            f"{bar_cell(figure.value, spread)}</tr>"
+            f"{bar_cell(figure.value, figure.spread)}</tr>"
         )
     head = '<th>figure</th><th class="n">per cent, 95% interval</th>'
     body = f'<div class="card">{table(head, "".join(rows))}</div>'
