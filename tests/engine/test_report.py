@@ -292,6 +292,14 @@ def test_undefined_figures_have_neither_interval_nor_verdict(tmp_path: Path) -> 
     assert not any("- to -" in text for text in (report.summary(), comparison.summary(), *pages))
 
 
+def test_a_report_from_where_the_system_tells_no_memory_is_shown(report: Report, tmp_path: Path) -> None:
+    provenance = dataclasses.replace(report.provenance, peak_memory_mib=float("nan"))
+    dataclasses.replace(report, provenance=provenance).save_json(tmp_path / "report.json")
+    again = read_report(tmp_path / "report.json")
+    assert math.isnan(again.provenance.peak_memory_mib)
+    assert "memory" in again.summary()
+
+
 def test_every_image_has_noise_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     images = Images(3)
     coded = images[1].image

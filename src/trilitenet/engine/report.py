@@ -392,11 +392,12 @@ def read_report(path: Path) -> Report:
         if schema > REPORT_SCHEMA:
             raise DataError(f"{path}: report schema {schema!r} is newer than {REPORT_SCHEMA}; upgrade trilitenet")
         state = mapping["state"]
-        provenance = Provenance(**{**mapping["provenance"], "canvas": tuple(mapping["provenance"]["canvas"])})
+        known = mapping["provenance"]
+        known |= {"canvas": tuple(known["canvas"]), "peak_memory_mib": _number(known["peak_memory_mib"])}
         scores: dict[str, Any] = {name: metrics.compute() for name, metrics in _metrics(state).items()}
         plots = mapping["detection_plots"]
         return Report(
-            provenance=provenance,
+            provenance=Provenance(**known),
             fair=scores.get("fair"),
             paper=scores.get("paper"),
             figures={
