@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 import json
 import math
 import re
@@ -67,6 +68,23 @@ def test_the_page_is_self_contained_and_escaped(report: Report, tmp_path: Path) 
     assert "$" not in text  # no placeholder left
     for tag in ("table", "div", "section", "figure", "svg", "tr", "td"):
         assert len(re.findall(f"<{tag}[ >]", text)) == text.count(f"</{tag}>"), tag
+
+
+def test_the_confusion_of_many_classes_has_the_width_of_the_page(report: Report, tmp_path: Path) -> None:
+    assert report.plots is not None
+    for count, wide in ((2, False), (10, True)):
+        names = ("background", *(f"<{number}>" for number in range(1, count)))  # a class may be called so, too
+        confusion = tuple(tuple(range(count + 1)) for _ in range(count + 1))
+        plots = dataclasses.replace(report.plots, class_names=(*names, "background"), confusion=confusion)
+        dataclasses.replace(report, plots=plots).save_html(tmp_path / "report.html")
+        page = (tmp_path / "report.html").read_text()
+        assert ('class="card wide"' in page) == wide
+        head, *rows = re.findall("<tr>(.*?)</tr>", page.partition("Confusion at")[2].partition("</table>")[0])
+        words = [html.escape(name) for name in names]
+        assert re.findall("<th>(.*?)</th>", head)[1:] == [*words, "missed"]
+        assert [row.split("</th>")[0].removeprefix("<th>") for row in rows] == [*words, "nothing there"]
+        assert re.findall("<td>(.*?)</td>", rows[0]) == [str(number) for number in range(count + 1)]
+        assert re.findall("<td>(.*?)</td>", rows[-1])[-1] == ""
 
 
 def test_the_terminal_form_names_every_figure(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:

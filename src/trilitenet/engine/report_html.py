@@ -99,21 +99,26 @@ def _detection(report: Report, plots: DetectionPlots) -> str:
         ),
         ("Confusion at the stated confidence", _confusion(plots)),
     ]
-    body = "".join(f'<div class="card"><h3>{escape(title)}</h3>{content}</div>' for title, content in cards)
+    # A table of more than a few classes takes the whole width.
+    kinds = ("card", "card", "card wide" if len(plots.class_names) > 4 else "card")
+    body = "".join(
+        f'<div class="{kind}"><h3>{title}</h3>{content}</div>'
+        for kind, (title, content) in zip(kinds, cards, strict=True)
+    )
     return section("Detection", f'<div class="grid">{body}</div>')
 
 
 def _confusion(plots: DetectionPlots) -> str:
-    names = plots.class_names
-    head = "".join(f"<th>{escape(name if name != 'background' else 'missed')}</th>" for name in names)
-    rows = []
-    for index, (name, counts) in enumerate(zip(names, plots.confusion, strict=True)):
-        last = index == len(names) - 1
-        cells = "".join(
-            "<td></td>" if last and column == index else f"<td>{count}</td>" for column, count in enumerate(counts)
-        )
-        rows.append(f"<tr><th>{escape('nothing there' if last else name)}</th>{cells}</tr>")
-    return table(f"<th>truth \\ prediction</th>{head}", "".join(rows), framed=True)
+    *names, _ = (escape(name) for name in plots.class_names)
+    rows = [[f"<td>{count}</td>" for count in counts] for counts in plots.confusion]
+    rows[-1][-1] = "<td></td>"
+    return table(
+        "".join(f"<th>{name}</th>" for name in ("truth \\ prediction", *names, "missed")),
+        "".join(
+            f"<tr><th>{name}</th>{''.join(row)}</tr>" for name, row in zip((*names, "nothing there"), rows, strict=True)
+        ),
+        framed=True,
+    )
 
 
 def _pixels(report: Report) -> str:
