@@ -175,6 +175,14 @@ def test_the_average_is_what_is_measured_and_kept(tmp_path: Path) -> None:
         torch.testing.assert_close(load_network(path).state_dict()[name], measured[name], rtol=1e-3, atol=1e-5)
 
 
+def test_the_card_claims_no_figure_that_is_undefined(tmp_path: Path) -> None:
+    run = trainer(tmp_path, max_steps=1, validate=lambda _network, _show: {"lane/iou": math.nan, "drivable/miou": 0.5})
+    result, _ = fit(run)
+    assert math.isnan(result.metrics["lane/iou"])
+    assert read_card(result.weights).metrics == {"val drivable/miou": 0.5}
+    assert read_card(tmp_path / "best-drivable.safetensors").metrics["val drivable/miou"] == 0.5
+
+
 def test_the_best_of_each_task_and_of_all_is_kept(tmp_path: Path) -> None:
     figures = iter(
         [

@@ -534,7 +534,8 @@ class Trainer:
 
     def _card(self) -> ModelCard:
         provenance = {**self.card.provenance, "steps": str(self.step)}
-        metrics = {f"val {name}": value for name, value in self.metrics.items()}
+        # A figure that is undefined, as of a task without labels, was not measured; JSON has no word for it either.
+        metrics = {f"val {name}": value for name, value in self.metrics.items() if math.isfinite(value)}
         return dataclasses.replace(self.card, metrics=metrics, provenance=provenance)
 
     def save(self) -> None:
