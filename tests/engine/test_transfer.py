@@ -59,3 +59,10 @@ def test_an_unknown_part_is_named() -> None:
         freeze(build_network("tiny"), ("encodr",))
     with pytest.raises(ConfigError, match="no part ''"):
         freeze(build_network("tiny"), ("",))
+    tops = "detection, drivable, encoder, lane, litepan, pcaa, reduce, spp"
+    for name in ("backbone", "backbone.stage1"):  # not the names of two hundred modules
+        with pytest.raises(ConfigError, match=f"no part 'backbone' to freeze; known: {tops}$"):
+            freeze(build_network("tiny"), (name,))
+    for name in ("levl1", "levl1.conv"):
+        with pytest.raises(ConfigError, match="no part 'levl1' of encoder to freeze; did you mean 'level1'"):
+            freeze(build_network("tiny"), (f"encoder.{name}",))

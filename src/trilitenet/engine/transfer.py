@@ -94,6 +94,12 @@ def keep_frozen(network: nn.Module, parts: Sequence[str]) -> None:
 
 def _part(network: nn.Module, name: str) -> nn.Module:
     modules: dict[str, nn.Module] = dict(network.named_modules())
-    if not name or name not in modules:
-        raise ConfigError(f"no part {name!r} to freeze{did_you_mean(name, [n for n in modules if n])}")
-    return modules[name]
+    if name and name in modules:
+        return modules[name]
+    within = name
+    while within not in modules:
+        within = within.rpartition(".")[0]
+    wrong = name.removeprefix(within).lstrip(".").partition(".")[0]
+    known = [part for part, _ in modules[within].named_children()]
+    of = f" of {within}" if within else ""
+    raise ConfigError(f"no part {wrong!r}{of} to freeze{did_you_mean(wrong, known)}")
