@@ -206,6 +206,21 @@ def test_the_best_of_each_task_and_of_all_is_kept(tmp_path: Path) -> None:
     assert read_card(result.weights).metrics["val lane/iou"] == 0.1
 
 
+@pytest.mark.parametrize("left", [0, 100])
+def test_damaged_best_weights_are_replaced_and_stop_no_run(tmp_path: Path, left: int) -> None:
+    figures = iter([{"lane/iou": 0.6, "drivable/miou": 0.5}, {"lane/iou": 0.4, "drivable/miou": 0.3}])
+    fit(trainer(tmp_path, batches=1, max_steps=1, validate=lambda _network, _show: next(figures)))
+    path = tmp_path / "best-lane.safetensors"
+    path.write_bytes(path.read_bytes()[:left])
+    later = trainer(tmp_path, batches=1, max_steps=2, validate=lambda _network, _show: next(figures))
+    shown: list[str] = []
+    later._show = shown.append  # type: ignore[method-assign]
+    result, _ = fit(later, resume=True)
+    assert shown[0] == f"{path}: is damaged; the next validation replaces it"
+    assert result.best == {"lane": 0.4, "drivable": 0.5, "overall": pytest.approx(0.55)}
+    assert read_card(path).metrics["best lane"] == 0.4
+
+
 def test_validations_without_progress_are_counted_over_a_stop(tmp_path: Path) -> None:
     figures = iter([0.5, 0.4, 0.4, 0.4])
     options: dict[str, Any] = {

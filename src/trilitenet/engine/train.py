@@ -631,7 +631,12 @@ class Trainer:
             path = self._best_path(name)
             if not path.is_file():
                 continue
-            value = read_card(path).metrics.get(f"best {name}", -math.inf)
+            try:
+                value = read_card(path).metrics.get(f"best {name}", -math.inf)
+            except WeightsError:  # the run needs no more of it than that
+                self._show(f"{path}: is damaged; the next validation replaces it")
+                self.best.pop(name, None)
+                continue
             if value > self.best.get(name, -math.inf):
                 self._ahead[name] = value
 
