@@ -137,6 +137,13 @@ def test_an_input_that_no_network_takes_is_refused() -> None:
         ModelCard("tiny", input_size=(360, 640))
 
 
+def test_a_card_holds_no_figure_that_json_has_not() -> None:
+    card = ModelCard("tiny", metrics={"val lane/iou": math.nan, "val drivable/miou": 0.5})
+    assert card.metrics == {"val drivable/miou": 0.5}
+    text = json.dumps(json.loads(card.to_json()) | {"metrics": {"val lane/iou": math.nan}})
+    assert ModelCard.from_json(text, "file").metrics == {}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

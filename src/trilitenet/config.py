@@ -187,7 +187,8 @@ class ModelCard:
         anchors: (width, height) in input pixels, three a level.
         thresholds: Decision thresholds fixed on a validation split.
         training_data: What it was trained on: one line a source, with counts and licence.
-        metrics: Measured figures, by name, with the split and protocol in the name.
+        metrics: Measured figures, by name, with the split and protocol in the name; what is no number, as of a task
+            that nothing is labelled for, is left out.
         licence: Licence and allowed use of the weights (the code's is apart).
         provenance: Recipe, commit, seed, hours, hardware, and whatever else tells where the weights come from.
         notes: What it is bad at, and anything a user should know.
@@ -211,6 +212,8 @@ class ModelCard:
     schema: int = CARD_SCHEMA
 
     def __post_init__(self) -> None:
+        known = {name: value for name, value in self.metrics.items() if math.isfinite(value)}  # as JSON has them
+        object.__setattr__(self, "metrics", known)
         check_size(self.input_size, "input_size")
         check_anchors(self.anchors)
         if not self.class_names:
