@@ -110,11 +110,13 @@ def test_a_table_is_filled_and_what_is_done_is_kept(artefacts: Artefacts, tmp_pa
     assert changed == {"report.json", "report.html"}
 
 
-def test_figures_without_a_value_hide_no_loss() -> None:
+def test_figures_without_a_value_are_dashes_and_hide_no_loss() -> None:
     key, other = "fair/detection/ap50", "paper/lane/iou"
     rows = [
         PrecisionRow("a", precision, "x", {key: math.nan, other: value})
         for precision, value in (("fp32", 0.3), ("int8", 0.2))
     ]
-    lost, figure = PrecisionTable(tuple(rows)).drop(rows[1])
+    table = PrecisionTable(tuple(rows))
+    lost, figure = table.drop(rows[1])
     assert (round(lost, 9), figure) == (10.0, other)
+    assert "| a | int8 | x | - |" in table.summary().splitlines()

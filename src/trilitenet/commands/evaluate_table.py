@@ -92,11 +92,12 @@ class PrecisionTable:
             first = self._first(row)
             cells = []
             for key in known:
-                if key not in row.figures:
+                value = row.figures.get(key, math.nan)
+                if math.isnan(value):
                     cells.append("-")
                     continue
-                points = 100 * (row.figures[key] - first.figures[key])
-                cells.append(f"{100 * row.figures[key]:.2f}" + ("" if row is first else f" ({points:+.2f})"))
+                points = 100 * (value - first.figures[key])
+                cells.append(f"{100 * value:.2f}" + ("" if row is first else f" ({points:+.2f})"))
             lines.append(markdown_row((row.model, row.precision, row.runtime, *cells)))
         return lines
 
