@@ -523,6 +523,21 @@ def test_a_clip_plays_at_its_speed_however_often_it_is_paused(page: Page, clip: 
     page.wait(lambda: page["play"].is_enabled() and page["seek"].is_enabled())
 
 
+def test_another_picture_ends_the_saving_of_a_clip(page: Page, clip: Path, photo: Path) -> None:
+    page.script("document.getElementById('rate').value = '2'")
+    page.choose(clip)
+    page.wait(lambda: page["player"].is_displayed() and not page["progress-row"].is_displayed())
+    page["save-clip"].click()
+    page.wait(lambda: page["save-clip"].text.startswith("Saving 2"))
+    page.choose(photo)
+    page.wait(lambda: page["error"].text == "The clip was not saved, as something else was opened.")
+    page.wait(lambda: not page["player"].is_displayed())
+    page.choose(clip)
+    page.wait(lambda: page["player"].is_displayed() and not page["progress-row"].is_displayed())
+    assert page["save-clip"].text == "Save clip"
+    assert all(page[name].is_enabled() for name in ("save-clip", "play", "seek"))
+
+
 def test_frames_for_which_there_was_no_time_are_asked_for_again(
     page: Page, server: Running, clip: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

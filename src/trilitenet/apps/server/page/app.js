@@ -19,7 +19,7 @@ let current = null; // the prepared frame on the canvas
 let position = 0;
 let rate = 5;
 let fileName = "picture";
-let player = null; // what plays the clip, until it is paused
+let player = null; // what plays or saves the clip, until it is paused
 let work = null; // AbortController of what runs now
 let met = null; // promise of what the service says of its model
 let retry = null; // what to do again once there is a token
@@ -290,7 +290,8 @@ function saveJson() {
 }
 
 async function saveClip() {
-  stopPlaying();
+  const mine = (player = {}); // another job, whose frames are others, ends it as it ends the playing
+  element("play").textContent = "Play";
   const button = element("save-clip");
   const recorder = new MediaRecorder(view.captureStream());
   const controls = [button, element("play"), element("seek")]; // which would change what is recorded
@@ -302,14 +303,16 @@ async function saveClip() {
   });
   await showFrame(0, false);
   recorder.start();
-  for (let index = 0; index < frames.length; index += 1) {
+  for (let index = 0; player === mine && index < frames.length; index += 1) {
     button.textContent = `Saving ${index + 1} / ${frames.length}`;
     await showFrame(index, false);
     await pause(1000 / rate);
   }
   recorder.stop();
   await stopped;
-  save(new Blob(pieces, { type: "video/webm" }), ".webm");
+  if (player === mine) save(new Blob(pieces, { type: "video/webm" }), ".webm");
+  else showError("The clip was not saved, as something else was opened.");
+  player = null;
   button.textContent = "Save clip";
   for (const control of controls) control.disabled = false;
 }
