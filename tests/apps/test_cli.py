@@ -64,9 +64,16 @@ def test_a_command_is_its_function(greet: list[object], capsys: pytest.CaptureFi
     assert capsys.readouterr().out == "hello Ada\n"
 
 
-def test_a_lone_hyphen_is_standard_input(greet: list[object]) -> None:
+def test_a_lone_hyphen_is_a_word_but_no_value_of_an_option(
+    greet: list[object], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["greet", "-"]) == 0
-    assert greet == [("stdin", 1)]
+    assert greet == [("-", 1)]
+    assert cli.main(["greet", "--name", "-"]) == 2
+    assert capsys.readouterr().err == (
+        "error: Invalid value for --name: - is standard input, which only a source can be; give a name "
+        "(see: trilitenet greet --help)\n"
+    )
 
 
 def test_a_result_is_shown_and_decides_the_exit_code(greet: list[object], capsys: pytest.CaptureFixture[str]) -> None:

@@ -95,6 +95,8 @@ GROUPS: Final = {
 
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 """Characters that end a line or control a terminal."""
+_HYPHEN: Final = "\0"
+"""Stands for a lone hyphen, which the parser takes for an option without a name; no word that is typed holds it."""
 _ROOT_OPTIONS: Final = ("--help", "-h", "--version")
 _SPINS: Final = "10000"
 """Turns for which a thread of PyTorch's spins while it waits for another, by default 300,000. Where other processes
@@ -132,7 +134,11 @@ def build_app(words: Sequence[str] = ()) -> cyclopts.App:
 
 
 def _converted(type_: Any, tokens: Sequence[cyclopts.Token]) -> Any:
-    """Convert words as the parser does, but round no fraction where whole numbers are asked for."""
+    """Convert words as the parser does, with a lone hyphen among them, but round no fraction to a whole number."""
+    hyphen = next((token for token in tokens if token.value == _HYPHEN and token.keyword is not None), None)
+    if hyphen is not None:
+        raise cyclopts.CoercionError(token=hyphen, msg="- is standard input, which only a source can be; give a name")
+    tokens = [token.evolve(value="-") if token.value == _HYPHEN else token for token in tokens]
     if int in (type_, *get_args(type_)):
         fraction = next((token for token in tokens if "." in token.value), None)
         if fraction is not None:
@@ -188,8 +194,7 @@ def main(words: Sequence[str] | None = None) -> int:
     """
     _open_closed_streams()
     ends = words is None  # with this function, the process
-    # A lone "-" is standard input, not an option without a name.
-    words = ["stdin" if word == "-" else word for word in (sys.argv[1:] if words is None else words)]
+    words = sys.argv[1:] if words is None else words
     if ends and words[:1] == ["predict"] and "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)  # read when PyTorch is imported
     level = os.environ.get("TRILITENET_LOG", "WARNING").upper()
@@ -200,7 +205,7 @@ def main(words: Sequence[str] | None = None) -> int:
         if not known:
             raise ConfigError(f"TRILITENET_LOG={level} is no level of a log; take DEBUG, INFO, WARNING or ERROR")
         _check_command(words)
-        words = _repeated(words)
+        words = [_HYPHEN if word == "-" else word for word in _repeated(words)]
         with needing_torch():
             app = build_app(words)
             with _interruptible(ends):
