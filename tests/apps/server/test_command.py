@@ -87,6 +87,7 @@ def test_mistakes_are_told_in_one_line(started: list[Any], tmp_path: Path, capsy
             (["--port", port], f"cannot listen on 127.0.0.1 port {port} (Address already in use); choose"),
             (["--port", "99999"], "cannot listen"),
             (["--host", ""], "0.0.0.0 lets other machines in"),
+            (["--host", "ü..x"], "cannot listen on ü..x port 8000 (encoding of hostname failed)"),
         ):
             assert cli.main(["serve", *words]) == 1
             error = capsys.readouterr().err

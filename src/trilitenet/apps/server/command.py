@@ -131,14 +131,14 @@ def _listen(host: str, port: int) -> socket.socket:
         if listener.family == socket.AF_INET6:
             listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
         listener.bind((host, port))
-    except OSError as error:
+    except (OSError, TypeError) as error:  # the latter of a name that cannot be encoded
         listener.close()
         raise _cannot_listen(host, port, error) from error
     return listener
 
 
-def _cannot_listen(host: str, port: int, error: OSError) -> ConfigError:
-    reason = error.strerror or str(error)
+def _cannot_listen(host: str, port: int, error: OSError | TypeError) -> ConfigError:
+    reason = getattr(error, "strerror", None) or str(error)
     return ConfigError(f"cannot listen on {host} port {port} ({reason}); choose with --host and --port")
 
 
