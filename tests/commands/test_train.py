@@ -1113,11 +1113,16 @@ def test_further_data_are_drawn_by_their_weight(scenes: Path, tmp_path: Path) ->
 
 
 def test_the_cards_of_mixed_data_name_all(
-    scenes: Path, tmp_path: Path, made: Callable[..., dict[str, Any]], caplog: pytest.LogCaptureFixture
+    scenes: Path,
+    tmp_path: Path,
+    made: Callable[..., dict[str, Any]],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     more = shutil.copytree(scenes, tmp_path / "more")
     shutil.rmtree(more / "ll_seg_annotations" / "train")
-    parts = made(**settings(more, tmp_path / "run", extra_data={str(scenes): 1.0}))
+    monkeypatch.chdir(more)
+    parts = made(**settings(Path(), tmp_path / "run", extra_data={str(scenes): 1.0}))
     assert parts["card"].training_data == (f"more, {scenes.name} (train): 20 images",)
     assert "no image" not in caplog.text  # one of the two is labelled for lanes
 

@@ -14,6 +14,7 @@ from trilitenet.data.description import (
     DatasetDescription,
     MaskMeaning,
     class_table,
+    folder_name,
     read_description,
     write_description,
 )
@@ -171,6 +172,13 @@ def test_mask_values_have_a_meaning(root: Path) -> None:
     assert np.flatnonzero(~sample.drivable_valid.all(axis=1)).tolist() == [2]
     assert sample.boxes is None
     assert sample.lane is None
+
+
+def test_a_folder_is_called_alike_however_its_path_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "yard" / "north").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "yard" / "north")
+    assert [folder_name(path) for path in ("..", Path(), "../north/")] == ["yard", "north", "north"]
+    assert read_description(Path()).name == "north"
 
 
 def test_description_round_trip(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from trilitenet.data.checking import KINDS, CheckReport, check_dataset, detect_l
 from trilitenet.data.contact_sheet import contact_sheet, draw_sample, pick
 from trilitenet.data.converting import ConversionOptions, ConversionReport
 from trilitenet.data.converting import convert as run_conversion
-from trilitenet.data.description import DatasetDescription
+from trilitenet.data.description import DatasetDescription, folder_name
 from trilitenet.data.prepared import CACHE_FOLDER, is_prepared
 from trilitenet.data.prepared import prepare as run_preparation
 from trilitenet.data.reading import IMAGE_FOLDER, DrivingDataset
@@ -153,7 +153,7 @@ def convert(
     unknown = {item.rpartition("=")[0] for item in lane_width} - {"", "*", *records.splits}
     if unknown:
         raise ConfigError(f"--lane-width names no split {min(unknown)!r}; there are {', '.join(records.splits)}")
-    description = DatasetDescription(name=mapping.name, licence=mapping.licence, source=f"{chosen}: {Path(raw).name}")
+    description = DatasetDescription(name=mapping.name, licence=mapping.licence, source=f"{chosen}: {folder_name(raw)}")
     with show_progress("images") as advance:
         report = run_conversion(
             records,
@@ -328,7 +328,7 @@ def show(
             f"{name}: {len(indices)} of {len(dataset)}": _all_fitted(dataset, indices, max(width, 480))
             for name, (dataset, indices) in groups.items()
         }
-        write_file(output, picture_page(f"{root.name} {' '.join(where)}".strip(), pictures))
+        write_file(output, picture_page(f"{folder_name(root)} {' '.join(where)}".strip(), pictures))
     else:
         samples = [dataset[index] for dataset, indices in groups.values() for index in indices]
         names = next(iter(groups.values()))[0].class_names

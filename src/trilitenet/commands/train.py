@@ -34,6 +34,7 @@ from trilitenet.commands.paths import StrPath, optional_path
 from trilitenet.commands.progress import show_bars
 from trilitenet.config import DEFAULT_ANCHORS, ModelCard, parse_yaml
 from trilitenet.data.contact_sheet import as_perception
+from trilitenet.data.description import folder_name
 from trilitenet.data.identity import identify, parts_of
 from trilitenet.data.loader import build_loader
 from trilitenet.data.prepared import PreparedDataset, is_prepared, open_dataset
@@ -164,7 +165,7 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
             write_results(
                 folder / "results",
                 folder / "metrics.csv",
-                title=f"TriLiteNet {config.variant}: {folder.name}",
+                title=f"TriLiteNet {config.variant}: {folder_name(folder)}",
                 facts={**network.card.provenance, "training data": "; ".join(network.card.training_data)}
                 | {name: f"{value:.4f}" for name, value in result.metrics.items()},
                 pictures=[] if validation is None else _pictures(predictor, validation, config.pictures),
@@ -301,9 +302,7 @@ def _card(config: TrainConfig, network: TriLiteNet, dataset: SampleSource, recip
         network.card,
         class_names=tuple(dataset.class_names),
         input_size=config.input_size,
-        training_data=(
-            f"{', '.join(Path(root).name for root in roots)} ({config.train_split}): {len(dataset)} images",
-        ),
+        training_data=(f"{', '.join(map(folder_name, roots))} ({config.train_split}): {len(dataset)} images",),
         provenance=provenance,
     )
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import DEFAULT_ANCHORS
 from trilitenet.data.checking import KINDS, CheckReport
+from trilitenet.data.description import folder_name
 
 __all__ = ["check_page", "picture_page"]
 
@@ -52,7 +53,7 @@ def check_page(report: CheckReport, sheet: NDArray[np.uint8] | None = None) -> s
         for split in splits
     ]  # fmt: skip
     body = [
-        f"<h1>{_text(report.root.name)}</h1><p>{state}. Taken for {_text(report.layout)}.</p>",
+        f"<h1>{_text(folder_name(report.root))}</h1><p>{state}. Taken for {_text(report.layout)}.</p>",
         "<h2>Faults</h2>",
         _table(
             ["kind", "what", "split", "count", "examples"],
@@ -77,7 +78,7 @@ def check_page(report: CheckReport, sheet: NDArray[np.uint8] | None = None) -> s
     if sheet is not None:
         parts = [sheet[top : top + _MOST_ROWS] for top in range(0, len(sheet), _MOST_ROWS)]
         body += ["<h2>Some of it, with its labels</h2>", *map(_image, parts)]
-    return _page(f"Check of {report.root.name}", body)
+    return _page(f"Check of {folder_name(report.root)}", body)
 
 
 def picture_page(title: str, groups: Mapping[str, Iterable[NDArray[np.uint8]]]) -> str:

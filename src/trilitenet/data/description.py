@@ -18,6 +18,7 @@ __all__ = [
     "DatasetDescription",
     "MaskMeaning",
     "class_table",
+    "folder_name",
     "is_folder_name",
     "read_description",
     "write_description",
@@ -86,6 +87,12 @@ class DatasetDescription:
         return tuple(self.classes) or ("vehicle",)
 
 
+def folder_name(path: str | Path) -> str:
+    """Return what a folder is called, also by a path such as ``.`` that does not say it."""
+    path = Path(path)
+    return path.resolve().name if path.name in {"", ".."} else path.name
+
+
 def is_folder_name(split: str) -> bool:
     """Return whether a split is the name of one folder: its files stay inside the data set's."""
     return Path(split).name == split and split not in {"", ".", ".."} and "\0" not in split
@@ -117,7 +124,7 @@ def read_description(root: Path) -> DatasetDescription:
     """
     path = root / DESCRIPTION_FILE
     if not path.is_file():
-        return DatasetDescription(name=root.name)
+        return DatasetDescription(name=folder_name(root))
     try:
         return parse(DatasetDescription, read_yaml(path), str(path))
     except ConfigError as error:

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from trilitenet.data.description import folder_name
 from trilitenet.errors import import_extra, replacing
 
 __all__ = [
@@ -179,7 +180,7 @@ def build_loggers(
         elif name == "tensorboard":
             loggers.append(TensorBoardLogger(folder / "tensorboard", step))
         elif name == "mlflow":
-            loggers.append(MLflowLogger(folder.name, config))
+            loggers.append(MLflowLogger(folder_name(folder), config))
         elif name == "wandb":
-            loggers.append(WandbLogger(folder.name, config, folder))
+            loggers.append(WandbLogger(folder_name(folder), config, folder))
     return loggers
