@@ -13,7 +13,7 @@ import pytest
 from tests.data.published import write_annotation, write_published
 from trilitenet.data import checking
 from trilitenet.data.checking import KINDS, CheckReport, check_dataset, detect_layout
-from trilitenet.data.reading import DrivingDataset
+from trilitenet.data.reading import DrivingDataset, split_folders
 from trilitenet.errors import DataError
 
 pytest.importorskip("imagehash")
@@ -342,7 +342,10 @@ def test_hidden_files_are_passed_over(root: Path) -> None:
     before = check_dataset(root)
     for path in [path for path in root.rglob("*") if path.is_file()]:
         path.with_name(f"._{path.name}").write_bytes(b"\0\5\26\7")
+    for folder in ("images", "da_seg_annotations"):
+        shutil.copytree(root / folder / "val", root / folder / ".ipynb_checkpoints")
     assert check_dataset(root) == before
+    assert [path.name for path in split_folders(root)] == ["train", "val"]
 
 
 def test_labels_of_tasks_that_are_not_labelled_at_all_do_not_count(root: Path) -> None:

@@ -24,7 +24,7 @@ from trilitenet.data.converting import convert as run_conversion
 from trilitenet.data.description import DatasetDescription, folder_name
 from trilitenet.data.prepared import CACHE_FOLDER, is_prepared
 from trilitenet.data.prepared import prepare as run_preparation
-from trilitenet.data.reading import IMAGE_FOLDER, DrivingDataset
+from trilitenet.data.reading import DrivingDataset, split_folders
 from trilitenet.data.records import RecordSource
 from trilitenet.data.sample import Sample
 from trilitenet.engine.report import render
@@ -467,8 +467,7 @@ def _pair(item: str) -> tuple[str, str]:
 def _splits(root: Path) -> list[str]:
     if is_prepared(root):
         raise DataError(f"{root}: is a prepared data set; show the one that it was made from")
-    folder = root / IMAGE_FOLDER
-    splits = sorted(path.name for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+    splits = [path.name for path in split_folders(root)]
     if not splits:
         raise DataError(f"{root}: looks like {detect_layout(root)[1]}, not the published layout (images/SPLIT, ...)")
     return splits

@@ -33,6 +33,7 @@ from trilitenet.data.reading import (
     is_image_file,
     label_file,
     read_index,
+    split_folders,
 )
 from trilitenet.errors import DataError, few, import_extra
 from trilitenet.processing.boxes import best_side_ratio
@@ -249,8 +250,7 @@ def check_dataset(
     job = _Job(root, description, class_table(description.class_names, description.classes))
     names = {
         folder.name: sorted(path.name for path in folder.iterdir() if is_image_file(path.name) and not path.is_dir())
-        for folder in sorted((root / IMAGE_FOLDER).iterdir())
-        if folder.is_dir()
+        for folder in split_folders(root)
     }
     work = [(split, name) for split, items in names.items() for name in items]
     facts: dict[str, list[_Facts]] = {split: [] for split in names}
@@ -486,7 +486,7 @@ def _find_orphans(job: _Job, names: dict[str, list[str]], collector: _Collector)
         read = task == "detection" or task in job.description.tasks  # annotations hold the attributes, too
         if not (read and (root / folder).is_dir()):
             continue
-        for split in sorted(path.name for path in (root / folder).iterdir() if path.is_dir()):
+        for split in (path.name for path in split_folders(root, folder)):
             images = {Path(name).stem for name in names.get(split, ())}
             for path in sorted((root / folder / split).iterdir()):
                 where = path.relative_to(root).as_posix()

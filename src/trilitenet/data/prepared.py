@@ -45,6 +45,7 @@ from trilitenet.data.reading import (
     decode_image,
     is_image_file,
     label_file,
+    split_folders,
 )
 from trilitenet.data.sample import BOXES, MASKS, VALID, Sample
 from trilitenet.errors import Claim, ConfigError, DataError, OutputError, import_extra, replacing, writing
@@ -148,7 +149,7 @@ def prepare(
     if splits is not None:
         chosen = list(splits)
     else:
-        folders = sorted(path for path in (root / IMAGE_FOLDER).glob("*") if path.is_dir())
+        folders = split_folders(root)
         chosen = [path.name for path in folders if any(is_image_file(file.name) for file in path.iterdir())]
     if not chosen:
         raise DataError(

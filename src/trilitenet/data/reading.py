@@ -49,6 +49,7 @@ __all__ = [
     "parse_annotation",
     "read_index",
     "sampling_weights",
+    "split_folders",
 ]
 
 _LOGGER: Final = logging.getLogger(__name__)
@@ -89,6 +90,14 @@ class SampleSource(Protocol):
 def is_image_file(name: str) -> bool:
     """Return whether a file's name is one of an image; hidden ones, such as ``._0001.jpg`` of macOS, are none."""
     return not name.startswith(".") and name.lower().endswith(IMAGE_ENDINGS)
+
+
+def split_folders(root: Path, top: str = IMAGE_FOLDER) -> list[Path]:
+    """Return the folders, one a split, of a data set's images (or of ``top``), sorted; hidden ones are passed over."""
+    folder = root / top
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
 
 
 def label_file(task: Task, split: str, name: str) -> str:
