@@ -96,6 +96,11 @@ def test_a_report_that_cannot_be_written_is_told_before_the_work(tmp_path: Path)
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="cannot be written"):
         check_output(tmp_path / "file" / "report", overwrite=True)
+    (tmp_path / "report.html").mkdir()
+    with pytest.raises(OutputError, match=r"report\.html: cannot be written \(it is a folder\)"):
+        check_output(tmp_path, overwrite=True)
+    with pytest.raises(OutputError, match=r"holds report\.html already"):
+        check_output(tmp_path, overwrite=False)
 
 
 def test_what_can_be_written_is_told_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

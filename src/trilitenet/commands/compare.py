@@ -41,7 +41,7 @@ def compare(
         raise ConfigError("give at least one report.json, or a folder that holds one")
     check_counts(resamples)
     output = optional_path(output)
-    check_output(output, overwrite, "comparison.json")
+    check_output(output, overwrite, "comparison")
     paths = list(map(Path, reports))
     files = [path / "report.json" if path.is_dir() else path for path in paths]
     repeated = [path for path, count in Counter(file.resolve() for file in files).items() if count > 1]

@@ -260,17 +260,18 @@ def check_counts(
         raise ConfigError(f"--limit must be at least 1, got {limit}; leave it out for all images")
 
 
-def check_output(output: Path | None, overwrite: bool, name: str = "report.json") -> None:
-    """Refuse, before hours of work, a folder that holds a file of this name or cannot be written.
+def check_output(output: Path | None, overwrite: bool, name: str = "report") -> None:
+    """Refuse, before hours of work, a folder that holds a page or JSON of this name, or cannot be written.
 
     Raises:
         OutputError: If it is so.
     """
     if output is None:
         return
-    if not overwrite and (output / name).exists():
-        raise OutputError(f"{output}: holds {name} already; give another folder or --overwrite")
-    check_writable(output / name)
+    for file in (output / f"{name}.json", output / f"{name}.html"):
+        if not overwrite and file.exists():
+            raise OutputError(f"{output}: holds {file.name} already; give another folder or --overwrite")
+        check_writable(file)
 
 
 def write_report(report: Report, output: Path | None) -> None:
