@@ -102,6 +102,17 @@ def test_it_loads_in_silence(program: Path, tmp_path: Path) -> None:
     assert (done.stdout, done.stderr) == ("", "said\n")
 
 
+def test_it_runs_where_the_standard_streams_are_closed(program: Path, tmp_path: Path) -> None:
+    code = (
+        "import sys, numpy, trilitenet\n"
+        "found = trilitenet.load(sys.argv[1])(numpy.zeros((64, 128, 3), numpy.uint8))\n"
+        "open('done', 'w').write(str(found.lane.shape))\n"
+    )
+    words = ["sh", "-c", 'exec "$0" -c "$1" "$2" <&- >&- 2>&-', sys.executable, code, str(program)]
+    subprocess.run(words, cwd=tmp_path, check=True, timeout=240)
+    assert (tmp_path / "done").read_text() == "(64, 128)"
+
+
 def test_standard_error_is_there_after_programs_that_threads_load_at_once() -> None:
     before = os.fstat(2)
     entered, leave = threading.Event(), threading.Event()

@@ -95,14 +95,21 @@ class ExecuTorchBackend(ArtefactBackend):
 
 @contextlib.contextmanager
 def _unsaid() -> Iterator[None]:
-    """Inside, nothing reaches standard error: ExecuTorch logs there what it looks up, and what is raised as well."""
-    with _SILENCE:
+    """Inside, nothing reaches standard error: ExecuTorch logs there what it looks up, and what is raised as well.
+
+    Standard streams that are closed are opened to nowhere, and stay so: each run of a program looks up how to write to
+    both.
+    """
+    with _SILENCE, contextlib.ExitStack() as stack:
+        for name in ("stdout", "stderr"):
+            if getattr(sys, name) is None:
+                setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115
         sys.stderr.flush()
-        kept = os.dup(2)
-        try:
-            with Path(os.devnull).open("w", encoding="utf-8") as sink:
-                os.dup2(sink.fileno(), 2)
-            yield
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+        sink = stack.enter_context(Path(os.devnull).open("w", encoding="utf-8"))
+        stack.enter_context(contextlib.redirect_stderr(sink))
+        with contextlib.suppress(OSError):  # its number may still be free
+            kept = os.dup(2)
+            stack.callback(os.close, kept)
+            stack.callback(os.dup2, kept, 2)
+            os.dup2(sink.fileno(), 2)
+        yield
