@@ -242,6 +242,8 @@ def part_of(path: Path) -> Path:
 class Claim:
     """Keeps others, in this process and elsewhere, from writing a file, while it is written as `part_of` names it.
 
+    So too where that has been given the file's own name and is added to.
+
     Where the system or the file system knows no locks, it keeps off nobody.
 
     Args:
@@ -253,6 +255,7 @@ class Claim:
 
     def __init__(self, path: Path) -> None:
         part, number = part_of(path), None
+        taken = OutputError(f"{path}: it is being written already; wait for its end, or choose another --output")
         while fcntl is not None and number is None:
             try:
                 number = os.open(part, os.O_RDWR | os.O_CREAT, 0o666)
@@ -263,14 +266,16 @@ class Claim:
                     os.close(number)
                     number = None
                     if isinstance(error, BlockingIOError):
-                        reason = "it is being written already; wait for its end, or choose another --output"
-                        raise OutputError(f"{path}: {reason}") from None
+                        raise taken from None
                 break  # what is wrong with its place is told by whoever writes it
             if not _is_named(number, part):  # the other has just given it its name
                 os.close(number)
                 number = None
         self._let_go = weakref.finalize(self, _let_go, number, part)
         self._let_go.atexit = False
+        if _is_claimed(path):
+            self.close()
+            raise taken
 
     def close(self) -> None:
         """Let the file go; what has not got its name by then is removed."""
@@ -283,6 +288,20 @@ def _let_go(number: int | None, part: Path) -> None:
             part.unlink()
     if number is not None:
         os.close(number)
+
+
+def _is_claimed(path: Path) -> bool:
+    """Return whether somebody has claimed the file that has this name now."""
+    with contextlib.suppress(OSError):
+        number = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))  # a pipe would wait for a writer
+        try:
+            if fcntl is not None:
+                fcntl.flock(number, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        finally:
+            os.close(number)
+    return False
 
 
 def _is_named(number: int, path: Path) -> bool:

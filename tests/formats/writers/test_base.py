@@ -81,6 +81,20 @@ def test_a_file_that_another_process_writes_is_left_to_it(
     assert not list(tmp_path.glob("*.part"))
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="files are not locked there")
+@pytest.mark.parametrize(("name", "file"), [("jsonl", "perceptions.jsonl"), ("csv", "frames.csv")])
+def test_a_file_that_grows_is_left_to_its_writer(name: str, file: str, tmp_path: Path, video: list[Perception]) -> None:
+    with open_writer(name, tmp_path, overwrite=True) as writer:
+        writer.write(dataclasses.replace(video[0], source="a.mp4"))
+        files = sorted(tmp_path.iterdir())
+        with pytest.raises(OutputError, match=rf"{file}: it is being written already; wait for its end"):
+            open_writer(name, tmp_path, overwrite=True)
+        assert sorted(tmp_path.iterdir()) == files
+        writer.write(dataclasses.replace(video[1], source="a.mp4"))
+    assert len((tmp_path / file).read_text().splitlines()) == 2 + (name == "csv")
+    open_writer(name, tmp_path, overwrite=True).close()
+
+
 def test_a_writer_that_is_given_nothing_replaces_nothing(
     format_name: str, tmp_path: Path, pictures: list[Perception]
 ) -> None:
