@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 import zlib
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.data.published import write_annotation, write_published
+from trilitenet.data.checking import check_dataset
 from trilitenet.data.description import (
     DatasetDescription,
     MaskMeaning,
@@ -198,13 +200,20 @@ def test_description_round_trip(tmp_path: Path) -> None:
     (tmp_path / "dataset.yaml").write_text("a: [")
     with pytest.raises(DataError, match="not YAML"):
         read_description(tmp_path)
-    with pytest.raises(DataError, match="both"):
+    with pytest.raises(DataError, match=r"^category 'x' belongs to both 'a' and 'b'$"):
         class_table(("a", "b"), {"a": ("x",), "b": ("x",)})
 
 
 def test_errors_name_the_file(root: Path) -> None:
     with pytest.raises(DataError, match="no folder images/val"):
         DrivingDataset(root, "val")
+    with pytest.raises(DataError, match=rf"^{re.escape(str(root))}: category 'car' belongs to both"):
+        DrivingDataset(root, "train", class_names=("vehicle", "car"))
+    (root / "dataset.yaml").write_text("classes: {a: [x], b: [x]}\n")
+    for read in (lambda: DrivingDataset(root, "train"), lambda: check_dataset(root)):
+        with pytest.raises(DataError, match=r"dataset\.yaml: category 'x' belongs to both 'a' and 'b'"):
+            read()
+    (root / "dataset.yaml").unlink()
     (root / "prepared.json").touch()
     with pytest.raises(DataError, match="a prepared copy, for training alone"):
         DrivingDataset(root, "val")

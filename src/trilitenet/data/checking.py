@@ -247,7 +247,7 @@ def check_dataset(
         cure = "" if layout == "unknown" else f"; convert it first: trilitenet data convert {layout} {root} OUT"
         raise DataError(f"{root}: looks like {words}, not the published layout (images/SPLIT, ...){cure}")
     description = read_description(root)
-    job = _Job(root, description, class_table(description.class_names, description.classes))
+    job = _Job(root, description, class_table(description.class_names, description.classes, root))
     names = {
         folder.name: sorted(path.name for path in folder.iterdir() if is_image_file(path.name) and not path.is_dir())
         for folder in split_folders(root)

@@ -98,21 +98,25 @@ def is_folder_name(split: str) -> bool:
     return Path(split).name == split and split not in {"", ".", ".."} and "\0" not in split
 
 
-def class_table(class_names: Sequence[str], classes: Mapping[str, Sequence[str]] | None = None) -> dict[str, int]:
+def class_table(
+    class_names: Sequence[str], classes: Mapping[str, Sequence[str]] | None = None, root: Path | None = None
+) -> dict[str, int]:
     """Return category -> class id.
 
     A class holds the categories that ``classes`` lists for it, else the category of its own name; ``vehicle`` alone
     also holds car, truck, bus and train.
 
     Raises:
-        DataError: If one category belongs to two classes.
+        DataError: If one category belongs to two classes; it names the description in ``root`` if that lists them.
     """
     table: dict[str, int] = {}
     for index, name in enumerate(class_names):
         default = VEHICLES if name == "vehicle" else (name,)
         for category in (classes or {}).get(name, default):
             if table.setdefault(category, index) != index:
-                raise DataError(f"category {category!r} belongs to both {class_names[table[category]]!r} and {name!r}")
+                where = "" if root is None else f"{root / DESCRIPTION_FILE if classes else root}: "
+                first = class_names[table[category]]
+                raise DataError(f"{where}category {category!r} belongs to both {first!r} and {name!r}")
     return table
 
 

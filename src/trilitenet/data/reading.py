@@ -243,7 +243,7 @@ class DrivingDataset:
         self.split = split
         self.description: DatasetDescription = read_description(self.root)
         self._class_names = tuple(class_names or self.description.class_names)
-        self._table = class_table(self._class_names, classes or self.description.classes)
+        self._table = class_table(self._class_names, classes or self.description.classes, self.root)
         self._tasks = tuple(tasks if tasks is not None else self.description.tasks)
         self._files = _image_files(self.root, split)
         if names is None:

@@ -127,6 +127,7 @@ def test_values(value: str | int, parsed: int | tuple[int, int, int]) -> None:
         ("drivable_mask: {path: x, values: {1: road}}", "known: direct"),
         ("drivable_mask: {path: x, values: {1: direct, '1,2,3': direct}}", "all levels or all colours"),
         ("drivabel: [road]", "did you mean 'drivable'"),
+        ("classes: {a: [x], b: [x]}", r"mapping\.yaml: category 'x' belongs to both 'a' and 'b'"),
         ("[1, 2", "not YAML"),
         ("- 1", "must hold 'key: value' lines"),
     ],

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import Task, check_tasks, parse, parse_json, read_yaml
-from trilitenet.data.description import VEHICLES
+from trilitenet.data.description import VEHICLES, class_table
 from trilitenet.data.reading import IMAGE_ENDINGS
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ObjectLabel, RunLabel
 from trilitenet.errors import ConfigError, DataError, brief
@@ -106,6 +106,7 @@ class LabelMapping:
     def __post_init__(self) -> None:
         if self.tasks:
             check_tasks(self.tasks)
+        class_table(tuple(self.classes), self.classes)  # refuses a category of two classes
         for name, path, known in (
             ("images", self.images, ("split",)),
             ("drivable_mask", self.drivable_mask.path, ("split", "name")),
