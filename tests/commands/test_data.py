@@ -295,8 +295,12 @@ def test_show_sheets_and_pages(published: Path, tmp_path: Path) -> None:
         show(published, tmp_path / "file" / "x.jpg")
     rest = show(published, tmp_path / "rest.html", split="train", where=["timeofday=night"], start=4)
     assert rest.count == 2
-    with pytest.raises(DataError, match="no image with timeofday=noon in any split"):
+    with pytest.raises(
+        DataError, match=r"no image with timeofday=noon in any split: none has timeofday 'noon'; known: day, night$"
+    ):
         show(published, sheet, where=["timeofday=noon"])
+    with pytest.raises(DataError, match=r"none has timeofday 'nihgt'; did you mean 'night'\?$"):
+        show(published, sheet, where=["timeofday=nihgt"])
     with pytest.raises(
         DataError, match=r"no image with time=night in val: none has .* 'time'; did you mean 'timeofday'\?"
     ):

@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -28,7 +28,7 @@ from trilitenet.data.reading import DrivingDataset, split_folders
 from trilitenet.data.records import RecordSource
 from trilitenet.data.sample import Sample
 from trilitenet.engine.report import render
-from trilitenet.errors import ConfigError, DataError, OutputError, did_you_mean, write_file
+from trilitenet.errors import ConfigError, DataError, OutputError, did_you_mean, few, write_file
 from trilitenet.formats.readers.bdd100k import read_bdd100k
 from trilitenet.formats.readers.coco import read_coco
 from trilitenet.formats.readers.cvat import read_cvat
@@ -318,10 +318,12 @@ def show(
     if not groups:
         which = f" with {', '.join(where)}" if where else ""
         after = f" after the first {start}" if start else ""
-        known = {key for dataset in datasets.values() for i in range(len(dataset)) for key in dataset.attributes(i)}
-        unknown = next((key for key in wanted if key not in known), None)
-        hint = "" if unknown is None else f": none has the attribute {unknown!r}{did_you_mean(unknown, known)}"
-        raise DataError(f"{root}: no image{which}{after} in {split or 'any split'}{hint}")
+        known: dict[str, set[str]] = {}
+        for dataset in datasets.values():
+            for index in range(len(dataset)):
+                for key, held in dataset.attributes(index).items():
+                    known.setdefault(key, set()).add(held)
+        raise DataError(f"{root}: no image{which}{after} in {split or 'any split'}{_what_is_unknown(wanted, known)}")
     shown = sum(len(indices) for _, indices in groups.values())
     if output.suffix.lower() == ".html":
         pictures = {
@@ -462,6 +464,19 @@ def _pair(item: str) -> tuple[str, str]:
     if not equals:
         raise ConfigError(f"--where wants ATTRIBUTE=VALUE, got {item!r}")
     return key, value
+
+
+def _what_is_unknown(wanted: Mapping[str, str], known: Mapping[str, Collection[str]]) -> str:
+    """Return the first attribute, or the first value, that no image has, and what was perhaps meant."""
+    for key in wanted:
+        if key not in known:
+            return f": none has the attribute {key!r}{did_you_mean(key, known)}"
+    for key, value in wanted.items():
+        if value not in known[key]:
+            near = did_you_mean(value, known[key])
+            hint = near if near.endswith("?") else f"; known: {few(sorted(known[key]), most=10)}"
+            return f": none has {key} {value!r}{hint}"
+    return ""
 
 
 def _splits(root: Path) -> list[str]:
