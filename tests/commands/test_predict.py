@@ -21,7 +21,7 @@ from PIL import Image
 from tests.fakes import ColourBackend, coloured_scene
 from trilitenet.apps import cli
 from trilitenet.commands.predict import RoadOptions, predict_with
-from trilitenet.errors import BackendError, ConfigError, InputError, OutputError, ShapeError
+from trilitenet.errors import BackendError, ConfigError, InputError, MissingExtraError, OutputError, ShapeError
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, VideoReader
 from trilitenet.inference.video import VideoWriter
@@ -145,6 +145,15 @@ def test_a_run_that_predicts_nothing_replaces_nothing(folder: Path, tmp_path: Pa
     report = predict_with(predictor, [folder / "text.txt"], output, format=formats, overwrite=True)
     assert (report.images, report.exit_code) == (0, 1)
     assert {path: path.read_bytes() for path in output.iterdir()} == before
+
+
+def test_a_format_without_its_package_is_refused_before_anything_is_made(
+    folder: Path, tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'trilitenet\[parquet\]'"):
+        predict_with(predictor, [folder / "photo.jpg"], tmp_path / "out", format=("jsonl", "parquet"))
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_source_is_never_overwritten(folder: Path, predictor: Predictor) -> None:

@@ -28,7 +28,7 @@ from typing import IO, TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.errors import Claim, ConfigError, FreeNames, OutputError, did_you_mean, part_of, writing
+from trilitenet.errors import Claim, ConfigError, FreeNames, OutputError, did_you_mean, import_extra, part_of, writing
 from trilitenet.structures import Perception
 
 if TYPE_CHECKING:
@@ -63,6 +63,8 @@ class Writer(abc.ABC):
         files: The files that are whole so far, those that grow by whole lines among them.
     """
 
+    EXTRA: ClassVar[tuple[str, str] | None] = None
+    """A package that it needs, and the extra that installs it."""
     FILES: ClassVar[tuple[str, ...]] = ()
     """Names of the files that it writes whatever it is given."""
     PICTURE_FILES: ClassVar[tuple[str, ...]] = ()
@@ -232,11 +234,14 @@ def find_writer(format: str) -> type[Writer]:
 
     Raises:
         ConfigError: If the format is unknown.
+        MissingExtraError: If the format needs a package that is not installed.
     """
     if format not in WRITERS:
         raise ConfigError(f"unknown format {format!r}{did_you_mean(format, WRITERS)}")
     module, _, name = WRITERS[format].partition(":")
     writer: type[Writer] = getattr(importlib.import_module(module), name)
+    if writer.EXTRA is not None:
+        import_extra(*writer.EXTRA)
     return writer
 
 

@@ -136,11 +136,12 @@ class ParquetWriter(Writer):
         MissingExtraError: If pyarrow is not installed.
     """
 
+    EXTRA = ("pyarrow.parquet", "parquet")
     FILES = ("perceptions.parquet",)
 
     def __init__(self, output: Path, *, overwrite: bool = False) -> None:
         self._arrow = import_extra("pyarrow", "parquet")
-        parquet = import_extra("pyarrow.parquet", "parquet")
+        parquet = import_extra(*self.EXTRA)
         super().__init__(output, overwrite=overwrite)
         arrow = self._arrow
         number, integer, text = arrow.float64(), arrow.int64(), arrow.string()
