@@ -259,12 +259,14 @@ def test_help_loads_no_runtime(words: list[str]) -> None:
     ("command", "given", "spins"),
     [
         ("predict", {}, "10000"),
+        ("evaluate", {}, "10000"),
+        ("serve", {}, "10000"),
         ("predict", {"GOMP_SPINCOUNT": "7"}, "7"),
         ("predict", {"OMP_WAIT_POLICY": "ACTIVE"}, None),
         ("train", {}, None),
     ],
 )
-def test_threads_wait_less_at_full_load_beside_the_stages_of_a_video(
+def test_threads_wait_less_at_full_load_where_a_network_is_only_run(
     command: str, given: dict[str, str], spins: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["trilitenet", command])

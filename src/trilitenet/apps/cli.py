@@ -98,6 +98,8 @@ _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 _HYPHEN: Final = "\0"
 """Stands for a lone hyphen, which the parser takes for an option without a name; no word that is typed holds it."""
 _ROOT_OPTIONS: Final = ("--help", "-h", "--version")
+_SPARING: Final = {"evaluate", "predict", "serve"}
+"""Commands that run a network without training it."""
 _SPINS: Final = "10000"
 """Turns for which a thread of PyTorch's spins while it waits for another, by default 300,000. Where other processes
 want the cores, the other waits for its own meanwhile; a training, which has them to itself, is 7% slower with fewer."""
@@ -195,7 +197,7 @@ def main(words: Sequence[str] | None = None) -> int:
     _open_closed_streams()
     ends = words is None  # with this function, the process
     words = sys.argv[1:] if words is None else words
-    if ends and words[:1] == ["predict"] and "OMP_WAIT_POLICY" not in os.environ:
+    if ends and _SPARING.intersection(words[:1]) and "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)  # read when PyTorch is imported
     level = os.environ.get("TRILITENET_LOG", "WARNING").upper()
     known = isinstance(logging.getLevelName(level), int)  # of a name it gives the number
