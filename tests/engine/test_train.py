@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from trilitenet.data.sample import Sample
 from trilitenet.engine.recipe import TrainConfig
 from trilitenet.engine.rescale import draw_size
 from trilitenet.engine.train import Trainer, TrainResult
-from trilitenet.errors import OutputError, WeightsError
+from trilitenet.errors import BackendError, OutputError, TrainingError, WeightsError
 from trilitenet.losses.detection import DetectionLoss
 from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.losses.multitask import MultiTaskLoss
@@ -231,6 +232,30 @@ def test_validations_without_progress_are_counted_over_a_stop(tmp_path: Path) ->
     fit(trainer(tmp_path, max_steps=6, **options))
     result, _ = fit(trainer(tmp_path, **options), resume=True)
     assert (result.steps, result.best["drivable"]) == (8, 0.5)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError("Unable to allocate 2.00 GiB for an array"),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:127] err == 0. DefaultCPUAllocator: can't allocate memory: ..."),
+        BackendError("torch cuda is out of memory for 8 images of 640x384; use a smaller batch"),
+    ],
+)
+def test_a_validation_without_memory_is_done_anew_by_resuming(tmp_path: Path, error: Exception) -> None:
+    if isinstance(error, BackendError):
+        error.__cause__ = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate ...")
+    options: dict[str, Any] = {"tasks": ("drivable",), "max_steps": 1}
+    told = (
+        r"^cpu is out of memory in the validation after step 1; make room, or go without it by --val-split ''; "
+        r"--resume goes on after step 1 of 1 \(epoch 1 of 10\)$"
+    )
+    with pytest.raises(TrainingError, match=told):
+        fit(trainer(tmp_path, validate=Mock(side_effect=error), **options))
+    result, _ = fit(trainer(tmp_path, validate=lambda *_: {"drivable/miou": 0.5}, **options), resume=True)
+    assert (result.steps, result.best["drivable"]) == (1, 0.5)
+    with pytest.raises(RuntimeError, match="a mistake"):
+        fit(trainer(tmp_path, validate=Mock(side_effect=RuntimeError("a mistake")), **options))
 
 
 def test_a_run_that_is_done_keeps_its_figures(tmp_path: Path) -> None:

@@ -282,7 +282,7 @@ class Trainer:
         except (DataError, OutputError) as error:  # it came between two steps
             raise type(error)(f"{error}; once that is mended, {self._keep()}") from error
         except RuntimeError as error:
-            if isinstance(error, torch.OutOfMemoryError) or _NO_MEMORY in str(error):
+            if _lacks_memory(error):
                 height, width = self.config.input_size
                 raise TrainingError(
                     f"{self.fabric.device} is out of memory in step {self.step} (a batch of {self.config.batch_size} "
@@ -463,6 +463,13 @@ class Trainer:
             self.metrics = dict(self.validate(self.averaged, show))
         except _LeftValidationError:
             return False
+        except (RuntimeError, MemoryError) as error:
+            if not (_lacks_memory(error) or _lacks_memory(error.__cause__)):
+                raise
+            raise TrainingError(
+                f"{self.fabric.device} is out of memory in the validation after step {self.step}; make room, or go "
+                f"without it by --val-split ''; {self._keep()}"
+            ) from error
         self._tell({f"val/{name}": value for name, value in self.metrics.items()})
         figures = ", ".join(f"{name} {value:.4f}" for name, value in self.metrics.items())
         self._show(f"epoch {epoch + 1}/{self.config.epochs}: {figures}")
@@ -639,6 +646,11 @@ class Trainer:
                 continue
             if value > self.best.get(name, -math.inf):
                 self._ahead[name] = value
+
+
+def _lacks_memory(error: BaseException | None) -> bool:
+    """Return whether an error is that memory is used up."""
+    return isinstance(error, (torch.OutOfMemoryError, MemoryError)) or _NO_MEMORY in str(error)
 
 
 def _changes(before: Mapping[str, Any], after: Mapping[str, Any], within: str = "") -> Iterator[str]:
