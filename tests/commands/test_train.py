@@ -198,6 +198,16 @@ def test_a_run_that_goes_on_without_validation_claims_no_figures(
     assert (result.steps, result.metrics, read_card(result.weights).metrics) == (5, {}, {})
 
 
+def test_other_validation_data_are_told_on_resuming(
+    scenes: Path, tmp_path: Path, straight: TrainResult, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = shutil.copytree(straight.folder, tmp_path / "run")
+    train(resume=True, **settings(scenes, run, **VALIDATED))
+    assert "was validated on" not in capsys.readouterr().err
+    train(resume=True, **settings(scenes, run, **VALIDATED | {"val_split": "train"}))
+    assert "was validated on 3 images, not 10: what is best is found anew" in capsys.readouterr().err
+
+
 def test_what_has_no_effect_is_told(scenes: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     data = shutil.copytree(scenes, tmp_path / "data")
     shutil.rmtree(data / "ll_seg_annotations" / "train")

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
@@ -85,6 +85,8 @@ def trainer(
     *,
     batches: int = 2,
     validate: Callable[[TriLiteNet, Any], Mapping[str, float]] | None = None,
+    measured_on: Mapping[str, Any] | None = None,
+    display: Any = None,
     teacher: TriLiteNet | None = None,
     **settings: Any,
 ) -> Trainer:
@@ -97,7 +99,8 @@ def trainer(
     fabric = lightning_fabric.Fabric(accelerator="cpu", devices=1, precision="32-true")
     fabric.launch()
     taught = None if teacher is None else (teacher, DistillationLoss(network.anchors, teacher.anchors, (1.0, 1.0, 1.0)))
-    return Trainer(config, network, loss, Batches(batches), fabric, network.card, validate=validate, teacher=taught)
+    options: dict[str, Any] = {"validate": validate, "measured_on": measured_on, "display": display}
+    return Trainer(config, network, loss, Batches(batches), fabric, network.card, teacher=taught, **options)
 
 
 def fit(run: Trainer, *, resume: bool = False) -> tuple[TrainResult, Log]:
@@ -232,6 +235,35 @@ def test_validations_without_progress_are_counted_over_a_stop(tmp_path: Path) ->
     fit(trainer(tmp_path, max_steps=6, **options))
     result, _ = fit(trainer(tmp_path, **options), resume=True)
     assert (result.steps, result.best["drivable"]) == (8, 0.5)
+
+
+def test_what_is_best_is_found_anew_on_other_validation_data(tmp_path: Path) -> None:
+    part = {"images": 2, "names": "a", "kind": "DrivingDataset", "content": ["x", "y"]}
+    data, other = ({"classes": ["car"], "parts": [part | {"images": count}]} for count in (2, 3))
+    display = Mock()
+
+    def go_on(score: float, on: Mapping[str, Any], steps: int) -> float:
+        run = trainer(
+            tmp_path,
+            validate=lambda *_: {"drivable/miou": score},
+            measured_on=on,
+            display=display,
+            tasks=("drivable",),
+            max_steps=steps,
+        )
+        result, _ = fit(run, resume=(tmp_path / "last.ckpt").exists())
+        assert read_card(tmp_path / "best-drivable.safetensors").metrics["best drivable"] == result.best["drivable"]
+        return result.best["drivable"]
+
+    assert go_on(0.9, data, 2) == 0.9
+    assert go_on(0.4, data, 4) == 0.9
+    stopped = trainer(tmp_path, measured_on=other, tasks=("drivable",), max_steps=5, validate_every=9, display=display)
+    fit(stopped, resume=True)  # which has not measured
+    told = call.line("was validated on 2 images, not 3: what is best is found anew")
+    assert display.mock_calls.count(told) == 1
+    assert go_on(0.5, other, 6) == 0.5
+    assert go_on(0.4, other, 8) == 0.5
+    assert display.mock_calls.count(told) == 2
 
 
 @pytest.mark.parametrize(

@@ -153,6 +153,7 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
             network.card,
             identity=identify(dataset),
             validate=None if validation is None else validate,
+            measured_on=None if validation is None else identify(validation),
             teacher=_teacher(config, network),
             display=display,
         )

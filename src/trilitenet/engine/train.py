@@ -166,6 +166,7 @@ class Trainer:
         identity: Of the training data, see `trilitenet.data.identity`; a checkpoint of other data is refused.
         validate: Returns figures of a network by name; see `FIGURES` for those that tell what is best. It is to call
             its second argument with how many images are measured, and of how many.
+        measured_on: Identity of the data that these are of; where a checkpoint has others, what is best is found anew.
         teacher: A network to distil from, and the loss for it.
         display: Shows the run.
     """
@@ -181,6 +182,7 @@ class Trainer:
         *,
         identity: Mapping[str, Any] | None = None,
         validate: Callable[[TriLiteNet, Callable[[int, int], None]], Mapping[str, float]] | None = None,
+        measured_on: Mapping[str, Any] | None = None,
         teacher: tuple[TriLiteNet, DistillationLoss] | None = None,
         display: Display | None = None,
     ) -> None:
@@ -190,6 +192,7 @@ class Trainer:
         self.card = card
         self.identity = identity
         self.validate = validate
+        self.measured_on = measured_on
         self.display = display
         self.folder = Path(config.output)
         self.loggers: Sequence[RunLogger] = ()
@@ -230,6 +233,8 @@ class Trainer:
 
         self.step = 0
         self.best: dict[str, float] = {}
+        self._best_of: Mapping[str, Any] | None = None
+        """Identity of the data that the best values were measured on."""
         self.metrics: dict[str, float] = {}
         self.stale = 0
         self.ended = 0
@@ -490,6 +495,7 @@ class Trainer:
                 card = dataclasses.replace(card, metrics={**card.metrics, f"best {name}": value})
                 save_network(self.averaged, self._best_path(name), card)
         self.best |= better  # not before the files are whole: after a full disk all of this is done anew
+        self._best_of = self.measured_on
         if scores:  # without labels nothing tells whether it is better
             self.stale = 0 if "overall" in better else self.stale + 1
 
@@ -562,6 +568,7 @@ class Trainer:
                 "loss": self.loss.state_dict(),
                 "scaler": self.fabric._precision.state_dict(),
                 "best": self.best,
+                "best_of": self._best_of,
                 "metrics": self.metrics,
                 "stale": self.stale,
                 "ended": self.ended,
@@ -606,7 +613,14 @@ class Trainer:
             reason = brief(error)[:200]  # of a network it names every tensor
             raise WeightsError(f"{path}: does not fit this run ({reason}); start anew with --overwrite") from error
         self._saved = self.step
-        self._read_best()
+        self._best_of = state.get("best_of")
+        before, now = self._best_of, self.measured_on
+        changed = tell_apart(before, now) if before and now else None
+        if changed:
+            self._show(f"was validated on {changed}: what is best is found anew")
+            self.best, self.stale = {}, 0
+        else:
+            self._read_best()
         self.guard.look()
         other = ", ".join(_changes(theirs, ours))
         if other:
