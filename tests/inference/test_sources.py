@@ -54,6 +54,17 @@ def video(path: Path, frames: int = 20, rate: float = 10, times: list[float] | N
     return path
 
 
+def encoded(path: Path, codec: str, frames: int, *, gop: int = 12, b_frames: int = 0) -> Path:
+    """Write a video at 10 frames a second in whatever its name ends in."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=10)
+        stream.width, stream.height, stream.pix_fmt = 160, 96, "yuv420p"
+        stream.codec_context.gop_size, stream.codec_context.max_b_frames = gop, b_frames
+        for frame in [*(av.VideoFrame.from_ndarray(shade(i), "rgb24") for i in range(frames)), None]:
+            container.mux(stream.encode(frame))
+    return path
+
+
 def transport_stream(first: int, frames: int) -> bytes:
     """Return an MPEG-TS stream, which can be cut anywhere, at 10 frames a second."""
     buffer = io.BytesIO()
@@ -614,6 +625,14 @@ def test_matroska_that_states_a_rate_it_does_not_keep_is_counted(tmp_path: Path,
     frames = list(VideoReader(tmp_path / "a.mkv"))
     assert [frame.timestamp for frame in frames] == pytest.approx([time / 1000 for time in times], abs=2e-3)
     assert [frame.index for frame in frames] == list(range(10))
+
+
+def test_frames_without_time_stamps_come_at_the_rate_of_the_stream(tmp_path: Path) -> None:
+    path = encoded(tmp_path / "a.h264", "libx264", 8)
+    for clip, indices in ((Clip(), range(8)), (Clip(start=0.4), range(4, 8))):
+        frames = list(VideoReader(path, clip))
+        assert [index_of(frame) for frame in frames] == [frame.index for frame in frames] == list(indices)
+        assert [frame.timestamp for frame in frames] == pytest.approx([i / 10 for i in indices])
 
 
 def test_recordings_one_after_the_other_are_one_video(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

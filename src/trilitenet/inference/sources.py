@@ -63,6 +63,8 @@ _SLACK: Final = 1e-6
 _WITH_LENGTH: Final = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "flv", "asf")
 """FFmpeg's names of the containers that state their length, which of others is found from what is there."""
 _INDEX_FIRST: Final = "its index comes first: ffmpeg -i IN -c copy -movflags +faststart OUT"
+_NO_TIMESTAMPS: Final = 0x80
+"""FFmpeg's flag of formats without time stamps, such as raw H.264, in which no time can be found."""
 _UNKNOWN: Final = 1 << 30
 """Frames that FFmpeg states in an AVI whose beginning it could not write again, as in a pipe."""
 _Decoded: TypeAlias = tuple[float, Callable[[], NDArray[np.uint8]]]
@@ -237,8 +239,7 @@ class VideoReader(FrameReader):
         else:
             with self._open() as container:
                 stream = container.streams.video[0]
-                rate = stream.average_rate or stream.guessed_rate
-                self.rate = float(rate) if rate else None
+                self.rate = _rate_of(container)
                 frames = stream.frames or None
                 if frames is None and container.duration and self.rate:
                     frames = round(container.duration / 1e6 * self.rate)
@@ -250,7 +251,7 @@ class VideoReader(FrameReader):
     def _decode(self) -> Any:
         astray, broken = False, self.broken
         with self._open() as container:
-            sought = bool(self.clip.start) and self._path != "-"
+            sought = bool(self.clip.start) and self._path != "-" and not container.format.flags & _NO_TIMESTAMPS
             if sought:
                 stream = container.streams.video[0]
                 first = stream.start_time or 0
@@ -626,6 +627,15 @@ def _open_container(path: str, name: str, *, timeout: float | None = None) -> An
     return container
 
 
+def _rate_of(container: Any) -> float | None:
+    """Return how many frames a second the first video stream has; None if unknown."""
+    stream = container.streams.video[0]
+    rate = stream.average_rate or stream.guessed_rate
+    if container.format.flags & _NO_TIMESTAMPS:  # to which FFmpeg gives 25 a second, whatever the video says
+        rate = stream.guessed_rate or rate
+    return float(rate) if rate else None
+
+
 def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
     """Yield the frames of the first video stream, those that cannot be decoded left out and counted.
 
@@ -636,7 +646,7 @@ def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
     """
     av = _av()
     stream = container.streams.video[0]
-    step = 1 / (reader.rate or float(stream.average_rate or 0) or 30.0)
+    step = 1 / (reader.rate or _rate_of(container) or 30.0)
     first = float(stream.start_time * stream.time_base) if stream.start_time is not None else None
     last = -step
     end = 0.0
