@@ -635,6 +635,17 @@ def test_frames_without_time_stamps_come_at_the_rate_of_the_stream(tmp_path: Pat
         assert [frame.timestamp for frame in frames] == pytest.approx([i / 10 for i in indices])
 
 
+def test_frames_that_avi_stores_in_another_order_than_they_are_shown_in_have_their_times(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = encoded(tmp_path / "a.avi", "libx264", 20, gop=5, b_frames=3)
+    for clip, indices in ((Clip(), range(20)), (Clip(start=1.2), range(12, 20))):
+        frames = list(VideoReader(path, clip))
+        assert [index_of(frame) for frame in frames] == [frame.index for frame in frames] == list(indices)
+        assert [frame.timestamp for frame in frames] == pytest.approx([i / 10 for i in indices])
+    assert caplog.text == ""
+
+
 def test_recordings_one_after_the_other_are_one_video(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "a.ts"
     path.write_bytes(transport_stream(0, 8) + transport_stream(8, 8))

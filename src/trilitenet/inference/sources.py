@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import functools
 import glob
+import heapq
 import itertools
 import logging
 import math
@@ -650,6 +651,9 @@ def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
     first = float(stream.start_time * stream.time_base) if stream.start_time is not None else None
     last = -step
     end = 0.0
+    places: list[int] = []
+    # AVI counts frames as they are stored, which is not how they are shown.
+    reordered = container.format.name == "avi" and stream.codec_context.has_b_frames
     # Without a length of its own, the video is measured by that of the container, which may be that of its sound.
     packets = container.demux(stream) if reader.live or stream.duration else container.demux()
     while True:
@@ -677,7 +681,11 @@ def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
         except av.FFmpegError:
             reader.broken += 1
             continue
+        if reordered and packet.dts is not None:
+            heapq.heappush(places, packet.dts)
         for frame in frames:
+            if places:
+                frame.pts = heapq.heappop(places)
             if frame.is_corrupt:
                 reader.broken += 1
                 continue
