@@ -60,7 +60,7 @@ _NUMBERED: Final = re.compile(r"%0?(\d*)d")
 _PATIENCE: Final = 10.0
 """Seconds without data after which a connection counts as broken."""
 _SLACK: Final = 1e-6
-"""Seconds that a time stamp may be off by: a frame at 1/3 s is not before a start of 0.333333."""
+"""Seconds that a time stamp may be off by: a frame at 2/3 s is not before a start of 0.666667."""
 _WITH_LENGTH: Final = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "flv", "asf")
 """FFmpeg's names of the containers that state their length, which of others is found from what is there."""
 _INDEX_FIRST: Final = "its index comes first: ffmpeg -i IN -c copy -movflags +faststart OUT"
@@ -167,6 +167,7 @@ class FrameReader(abc.ABC):
         self.expected: int | None = None
         self.broken = 0
         self.pixel_aspect: Fraction | None = None
+        self._skipped = 0  # frames before the first that `_decode` gives
         self._closed = threading.Event()
 
     def close(self) -> None:
@@ -175,7 +176,6 @@ class FrameReader(abc.ABC):
 
     def __iter__(self) -> Iterator[Frame]:
         given = seen = 0
-        last = -1
         broken = self.broken
         with contextlib.closing(self._decode()) as decoded:
             for count, (timestamp, make) in enumerate(decoded):
@@ -186,7 +186,7 @@ class FrameReader(abc.ABC):
                 seen += 1
                 if (seen - 1) % self.clip.every:
                     continue
-                index = last = max(last + 1, self._index(timestamp, count + self.broken - broken))
+                index = self._skipped + count + self.broken - broken
                 try:
                     image = make()
                 except InputError as error:
@@ -200,13 +200,6 @@ class FrameReader(abc.ABC):
         if not given:
             part = "" if self.clip.start == 0 and self.clip.end is None else " between --start and --end"
             raise InputError(f"{self.name}: has no frames that can be decoded{part}{self._cure}")
-
-    def _index(self, timestamp: float, count: int) -> int:
-        """Return the position in the video of a frame before which so many came, broken ones included.
-
-        Called once for each frame that is wanted, in order; what is not after the last one becomes the next number.
-        """
-        return count
 
     @abc.abstractmethod
     def _decode(self) -> Any:
@@ -234,7 +227,6 @@ class VideoReader(FrameReader):
         super().__init__("stdin" if str(path) == "-" else _without_secrets(str(path)), clip)
         self._path = str(path)
         self._timeout = timeout
-        self._skipped = 0
         if self._path == "-":
             self._cure = f"; an MP4 can be piped if {_INDEX_FIRST}"
         else:
@@ -274,9 +266,6 @@ class VideoReader(FrameReader):
         if self.broken:
             what = "frame was" if self.broken == 1 else "frames were"
             _LOGGER.warning("%s: %d broken %s left out", self.name, self.broken, what)
-
-    def _index(self, timestamp: float, count: int) -> int:
-        return self._skipped + count
 
 
 class StreamReader(FrameReader):
@@ -415,14 +404,7 @@ class SequenceReader(FrameReader):
     def _decode(self) -> Any:
         assert self.rate is not None
         for number, path in enumerate(self._paths):
-            timestamp = number / self.rate
-            if timestamp < self.clip.start - _SLACK:
-                continue
-            yield timestamp, functools.partial(read_image, path)
-
-    def _index(self, timestamp: float, count: int) -> int:
-        assert self.rate is not None
-        return round(timestamp * self.rate)
+            yield number / self.rate, functools.partial(read_image, path)
 
 
 @dataclasses.dataclass(frozen=True)
