@@ -5,6 +5,7 @@ import functools
 import http.server
 import io
 import logging
+import re
 import subprocess
 import sys
 import threading
@@ -111,6 +112,7 @@ def test_colours_survive_the_way_there_and_back(tmp_path: Path) -> None:
         (Clip(end=0.3), [0, 1, 2]),
         (Clip(start=0.52, end=1.2, every=3), [6, 9]),
         (Clip(start=0.55, end=1.2, every=3), [6, 9]),
+        (Clip(end=100, every=10), [0, 10]),
         (Clip(max_frames=2), [0, 1]),
         (Clip(start=1.0, max_frames=2, every=4), [10, 14]),
     ],
@@ -122,6 +124,12 @@ def test_parts_of_a_video(tmp_path: Path, clip: Clip, expected: list[int]) -> No
     assert [frame.timestamp for frame in frames] == pytest.approx([i / 10 for i in expected])
     assert reader.expected is not None
     assert abs(reader.expected - len(expected)) <= 1
+
+
+@pytest.mark.parametrize(("clip", "indices"), [(Clip(start=0.666667), [2, 3, 4]), (Clip(end=0.666667), [0, 1])])
+def test_a_time_is_met_to_six_places(tmp_path: Path, clip: Clip, indices: list[int]) -> None:
+    path = video(tmp_path / "a.mp4", frames=5, rate=3)
+    assert [frame.index for frame in VideoReader(path, clip)] == indices
 
 
 def test_a_variable_frame_rate_is_kept(tmp_path: Path) -> None:
@@ -203,8 +211,19 @@ def test_broken_frames_are_left_out_and_counted(tmp_path: Path, caplog: pytest.L
     assert indices[-1] == len(frames) + reader.broken - 1
 
 
+def test_a_frame_of_which_a_part_was_lost_is_left_out(tmp_path: Path) -> None:
+    data = transport_stream(0, 20)
+    lost = len(data) // 188 // 3 * 188
+    (tmp_path / "a.ts").write_bytes(data[:lost] + data[lost + 188 :])
+    reader = VideoReader(tmp_path / "a.ts")
+    assert len(list(reader)) >= 18
+    assert reader.broken == 1
+
+
 def test_a_video_cut_short_gives_what_there_is(tmp_path: Path) -> None:
     data = transport_stream(0, 20)
+    (tmp_path / "a.ts").write_bytes(data)
+    assert VideoReader(tmp_path / "a.ts").expected == 20
     (tmp_path / "a.ts").write_bytes(data[: len(data) // 2])
     assert 6 <= len(list(VideoReader(tmp_path / "a.ts"))) <= 12
 
@@ -409,8 +428,8 @@ class Server:
 
 
 def test_a_stream_that_dies_twice_is_picked_up(caplog: pytest.LogCaptureFixture) -> None:
-    with Server([transport_stream(0, 5), transport_stream(5, 5), transport_stream(10, 5)]) as server:
-        reader = StreamReader(server.url, retries=2, backoff=0.01)
+    with Server([transport_stream(0, 15), transport_stream(15, 4), transport_stream(19, 4)]) as server:
+        reader = StreamReader(server.url, retries=1, backoff=0.01)
         with caplog.at_level(logging.WARNING):
             frames = list(reader)
     seen = [index_of(frame) for frame in frames]
@@ -421,7 +440,7 @@ def test_a_stream_that_dies_twice_is_picked_up(caplog: pytest.LogCaptureFixture)
     assert times[0] == pytest.approx(0, abs=1e-3)
     assert reader.reconnections == 2
     assert "trying again" in caplog.text
-    assert "given up after 2 attempts" in caplog.text
+    assert "given up after 1 attempts (is not a video" in caplog.text
     assert "secret" not in caplog.text
     assert "token" not in frames[0].source
 
@@ -429,6 +448,16 @@ def test_a_stream_that_dies_twice_is_picked_up(caplog: pytest.LogCaptureFixture)
 def test_a_stream_that_never_comes_is_an_error_at_once() -> None:
     with Server([]) as server, pytest.raises(InputError, match=r"http://127\.0\.0\.1:\d+/live\.ts: is not a video"):
         list(StreamReader(server.url, backoff=60))
+
+
+def test_a_url_without_an_end_is_a_stream_and_one_without_an_answer_is_told_without_its_secrets() -> None:
+    with Server([transport_stream(0, 5)]) as server:
+        (source,), _ = find_sources([server.url])
+        assert isinstance(source, StreamReader)
+        (failure,) = find_sources([server.url])[1]
+    assert failure.source == source.name
+    assert failure.reason.startswith(f"{source.name}: is not a video")
+    assert not {"secret", "token"} & set(re.findall(r"\w+", f"{failure.source} {failure.reason}"))
 
 
 def test_closing_ends_the_wait_for_a_stream() -> None:
@@ -483,13 +512,14 @@ def test_numbered_pictures_are_a_video(tmp_path: Path) -> None:
     for i in (3, 4, 5, 7):
         Image.fromarray(shade(i)).save(tmp_path / f"img_{i:04d}.png")
     (tmp_path / "img_0005.png").write_bytes(b"broken")
-    (tmp_path / "img_0005x.png").write_bytes(b"another")
+    for other in ("img_0005x.png", "img_6.png"):
+        (tmp_path / other).write_bytes(b"another")
     reader = SequenceReader(str(tmp_path / "img_%04d.png"), rate=10)
     frames = list(reader)
     assert [index_of(frame) for frame in frames] == [3, 4, 7]
     assert [frame.timestamp for frame in frames] == [0, 0.1, pytest.approx(0.3)]
     assert [frame.index for frame in frames] == [0, 1, 3]
-    assert reader.broken == 1
+    assert (reader.broken, reader.expected) == (1, 4)
     assert reader.name == str(tmp_path / "img")
     later = list(SequenceReader(str(tmp_path / "img_%04d.png"), Clip(start=0.14), rate=10))
     assert [(frame.index, index_of(frame)) for frame in later] == [(3, 7)]
@@ -502,6 +532,8 @@ def test_numbered_pictures_are_a_video(tmp_path: Path) -> None:
 
 
 def test_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    released: list[Camera] = []
+
     class Camera:
         def __init__(self, number: int) -> None:
             self.left = 3 if number == 0 else 0
@@ -520,11 +552,12 @@ def test_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
             return self.left >= 0, blue_in_bgr
 
         def release(self) -> None:
-            pass
+            released.append(self)
 
     monkeypatch.setattr("cv2.VideoCapture", Camera)
     frames = list(CameraReader(0))
     assert len(frames) == 3
+    assert len(released) == 1
     assert frames[0].source == "camera-0"
     np.testing.assert_array_equal(frames[0].image[0, 0], [0, 0, 255])
     with pytest.raises(InputError, match="camera-7: there is no such camera"):
@@ -555,7 +588,7 @@ def test_what_a_user_names(tmp_path: Path) -> None:
     (folder / "below").mkdir(parents=True)
     for name in ("10.png", "9.png", ".hidden.png", "below/1.png"):
         Image.fromarray(shade(0)).save(folder / name)
-    video(folder / "7.mp4", frames=1)
+    video(folder / "7.MP4", frames=1)
     found, failures = find_sources([folder])
     assert [type(source) for source in found] == [VideoReader, Stills]
     assert isinstance(found[1], Stills)
@@ -580,6 +613,16 @@ def test_what_a_user_names(tmp_path: Path) -> None:
     (tmp_path / "nothing" / "below").mkdir()
     (failure,) = find_sources([tmp_path / "nothing"])[1]
     assert failure.reason.endswith(f"has no files itself; for those in its folders: {str(tmp_path / 'nothing/**/*')!r}")
+
+
+def test_what_is_there_by_a_name_is_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("2024").mkdir()
+    paths = tuple(map(Path, ("2024/a.png", "stdin", "100%done.png")))
+    for path in (*paths, Path("1.png")):
+        Image.fromarray(shade(0)).save(path, "png")
+    assert find_sources(["2024", *paths[1:]]) == ([Stills(paths)], [])
+    assert SequenceReader("%d.png").name == "sequence"
 
 
 def test_a_picture_by_two_ways_is_one_and_a_link_of_another_name_is_its_own(tmp_path: Path) -> None:
@@ -646,6 +689,25 @@ def test_frames_that_avi_stores_in_another_order_than_they_are_shown_in_have_the
     assert caplog.text == ""
 
 
+def test_what_is_well_before_the_start_is_not_read(tmp_path: Path) -> None:
+    reader = VideoReader(encoded(tmp_path / "a.mp4", "mpeg4", 20, gop=5), Clip(start=1.2))
+    assert next(reader._decode())[0] == 1.0
+    assert [frame.index for frame in reader] == list(range(12, 20))
+
+
+def test_broken_frames_that_come_before_the_first_after_the_start_are_counted_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def frames_of(_: Any, reader: FrameReader) -> Iterator[tuple[float, Callable[[], np.ndarray]]]:
+        reader.broken += 2
+        for i in (2, 3, 4):
+            yield i / 10, functools.partial(shade, i)
+
+    reader = VideoReader(video(tmp_path / "a.mp4"), Clip(start=0.3))
+    monkeypatch.setattr("trilitenet.inference.sources._frames_of", frames_of)
+    assert [frame.index for frame in reader] == [3, 4]
+
+
 def test_recordings_one_after_the_other_are_one_video(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "a.ts"
     path.write_bytes(transport_stream(0, 8) + transport_stream(8, 8))
@@ -674,11 +736,13 @@ def test_readers_of_one_name_are_told_apart(tmp_path: Path) -> None:
 
 
 def test_numbered_pictures_that_are_not_wanted_are_not_read(tmp_path: Path) -> None:
+    folder = tmp_path / "drive [1]"  # which is no pattern
+    folder.mkdir()
     for i in range(9):
-        Image.fromarray(shade(i)).save(tmp_path / f"{i}.png")
-    (tmp_path / "1.png").write_bytes(b"broken")
-    (tmp_path / "4.png").write_bytes(b"broken")
-    reader = SequenceReader(str(tmp_path / "%d.png"), Clip(every=4))
+        Image.fromarray(shade(i)).save(folder / f"{i}.png")
+    (folder / "1.png").write_bytes(b"broken")
+    (folder / "4.png").write_bytes(b"broken")
+    reader = SequenceReader(str(folder / "%d.png"), Clip(every=4))
     assert [frame.index for frame in reader] == [0, 8]
     assert reader.broken == 1
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -98,9 +99,13 @@ def test_prefetch_closes_the_generator_and_ends_its_thread() -> None:
             closed.set()
 
     before = threading.active_count()
-    Prefetch(items(), 1).close()
+    ahead = Prefetch(items(), 1)
+    ahead.close()
     assert closed.is_set()
     assert threading.active_count() == before
+    freed = weakref.ref(ahead)
+    del ahead
+    assert freed() is None
 
 
 def test_prefetch_forgets_the_oldest_of_a_live_source() -> None:
@@ -156,6 +161,18 @@ def test_leaving_early_ends_the_threads() -> None:
         next(iter(stream))
     assert source.given < 60
     assert threading.active_count() == before
+
+
+def test_leaving_ends_a_wait_for_a_stream_that_broke() -> None:
+    class Broken(Scenes):
+        def _decode(self) -> Iterator[tuple[float, object]]:
+            yield from super()._decode()
+            assert self._closed.wait(20)
+
+    with PerceptionStream(Broken(1, live=True), Predictor(ColourBackend())) as stream:
+        next(iter(stream))
+        began = time.monotonic()
+    assert time.monotonic() - began < 10
 
 
 def test_an_error_of_the_backend_arrives() -> None:
@@ -243,6 +260,8 @@ def test_a_browser_plays_it(tmp_path: Path, size: tuple[int, int]) -> None:
         stream = container.streams.video[0]
         assert stream.codec_context.name == "h264"
         assert stream.pix_fmt == "yuv420p"
+        context = stream.codec_context  # without these, players take what is high for BT.709
+        assert (context.colorspace, context.color_primaries, context.color_trc, context.color_range) == (6, 6, 6, 1)
         assert (stream.height, stream.width) == tuple(side + side % 2 for side in size)
         assert len(list(container.decode(stream))) == 5
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
@@ -271,12 +290,13 @@ def test_without_frames_there_is_no_file(tmp_path: Path) -> None:
 
 
 def test_an_unfinished_video_has_no_final_name(tmp_path: Path) -> None:
-    writer = VideoWriter(tmp_path / "a.mp4")
+    folder = tmp_path / "made"
+    writer = VideoWriter(folder / "a.mp4")
     for _ in range(3):
         writer.write(coloured_scene(32, 32))
-    assert not (tmp_path / "a.mp4").exists()
+    assert not (folder / "a.mp4").exists()
     writer.close()
-    assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
+    assert [file.name for file in folder.iterdir()] == ["a.mp4"]
 
 
 def test_a_frame_after_the_end_is_refused(tmp_path: Path) -> None:

@@ -357,7 +357,6 @@ class VideoWriter:
         if self.pixel_aspect is not None:
             context.sample_aspect_ratio = self.pixel_aspect
         context.colorspace = context.color_primaries = context.color_trc = 6  # SMPTE 170M, which is BT.601
-        context.color_range = 1
 
     def _mux(self, frame: Any) -> None:
         for packet in self._stream.encode(frame):
