@@ -75,7 +75,6 @@ def build_onnx(
         _store_half(onnx, model)
     model.producer_name = "trilitenet"
     model.producer_version = info.trilitenet
-    del model.metadata_props[:]
     onnx.helper.set_model_props(model, {CARD_KEY: card.to_json(), ARTEFACT_KEY: info.to_json()})
     _name_nodes(model)
     for value in (*model.graph.value_info, *model.graph.input, *model.graph.output):

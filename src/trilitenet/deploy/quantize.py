@@ -134,7 +134,6 @@ def quantize_onnx(model: Any, images: Sequence[NDArray[Any]], keep: Sequence[str
             extra_options={"ActivationSymmetric": True, "CalibMovingAverage": True},
         )
         quantized = onnx.load(str(target))
-    del quantized.metadata_props[:]
     onnx.helper.set_model_props(quantized, {entry.key: entry.value for entry in model.metadata_props})
     return quantized
 
