@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.nn.utils import prune
 
 from tests.deploy.networks import lively_network
 from trilitenet.config import STRIDES, ArtefactInfo, Thresholds
@@ -153,7 +154,8 @@ def test_thresholds_and_probabilities() -> None:
     assert torch.equal(probability, other)
 
 
-def test_each_task_has_the_threshold_of_the_card() -> None:
+@pytest.mark.parametrize("layout", ["vectors-tiny", "planar", "planar-maximum-heads"])
+def test_each_task_has_the_threshold_of_the_card(layout: str) -> None:
     network = lively_network()
     images = torch.randint(0, 256, (1, 64, 128, 3), dtype=torch.uint8)
     with torch.inference_mode():
@@ -163,7 +165,7 @@ def test_each_task_has_the_threshold_of_the_card() -> None:
         network.card = dataclasses.replace(
             network.card, thresholds=Thresholds(drivable=middle["drivable"], lane=middle["lane"])
         )
-        decided = DeployGraph(network)(images)
+        decided = DeployGraph(network, LAYOUTS[layout])(images)
     for task, share in shares.items():
         assert ((getattr(decided, task) == 1) == (share > middle[task])).float().mean() > 0.999
 
@@ -225,6 +227,10 @@ def test_hooks_are_refused() -> None:
     with pytest.raises(ConfigError, match="the hooks of lane"):
         DeployGraph(network)
     hook.remove()
+    prune.random_unstructured(network.encoder.level1.conv, "weight", 0.5)
+    with pytest.raises(ConfigError, match=r"the hooks of encoder\.level1\.conv"):
+        DeployGraph(network)
+    prune.remove(network.encoder.level1.conv, "weight")
     check(network)
 
 

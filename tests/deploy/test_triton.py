@@ -94,3 +94,9 @@ def test_a_broken_graph_is_named(tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match="no ONNX model"):
         write_triton_repository(broken, tmp_path / "repository", ModelCard("tiny"))
     assert not (tmp_path / "repository").exists()
+
+
+def test_a_repository_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(OutputError, match="file: cannot be written"):
+        write_triton_repository(_artefact(tmp_path / "x.onnx"), tmp_path / "file", ModelCard("tiny"))
