@@ -55,33 +55,29 @@ def video(path: Path, frames: int = 20, rate: float = 10, times: list[float] | N
     return path
 
 
-def encoded(path: Path, codec: str, frames: int, *, gop: int = 12, b_frames: int = 0) -> Path:
-    """Write a video at 10 frames a second in whatever its name ends in."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=10)
-        stream.width, stream.height, stream.pix_fmt = 160, 96, "yuv420p"
-        stream.codec_context.gop_size, stream.codec_context.max_b_frames = gop, b_frames
-        for frame in [*(av.VideoFrame.from_ndarray(shade(i), "rgb24") for i in range(frames)), None]:
-            container.mux(stream.encode(frame))
-    return path
-
-
-def transport_stream(first: int, frames: int) -> bytes:
-    """Return an MPEG-TS stream, which can be cut anywhere, at 10 frames a second."""
+def encoded(
+    first: int, frames: int, form: str, codec: str, *, pixels: str = "yuv420p", key_every: int = 1, b_frames: int = 0
+) -> bytes:
+    """Return a video at 10 frames a second, of one of FFmpeg's formats."""
     buffer = io.BytesIO()
-    with av.open(buffer, "w", format="mpegts") as container:
-        stream = container.add_stream("mpeg2video", rate=10)
-        stream.width, stream.height, stream.pix_fmt = 160, 96, "yuv420p"
-        stream.codec_context.gop_size = 1
+    with av.open(buffer, "w", format=form) as container:
+        stream = container.add_stream(codec, rate=10)
+        stream.width, stream.height, stream.pix_fmt = 160, 96, pixels
+        stream.codec_context.gop_size, stream.codec_context.max_b_frames = key_every, b_frames
         stream.bit_rate = 2_000_000
         for i in range(first, first + frames):
-            frame = av.VideoFrame.from_ndarray(shade(i), "rgb24")
+            frame = av.VideoFrame.from_ndarray(shade(i), "rgb24").reformat(format=pixels)
             frame.pts, frame.time_base = i - first, Fraction(1, 10)
             for packet in stream.encode(frame):
                 container.mux(packet)
         for packet in stream.encode(None):
             container.mux(packet)
     return buffer.getvalue()
+
+
+def transport_stream(first: int, frames: int) -> bytes:
+    """Return an MPEG-TS stream, which can be cut anywhere."""
+    return encoded(first, frames, "mpegts", "mpeg2video")
 
 
 def test_a_video_gives_every_frame_in_order_with_its_time(tmp_path: Path) -> None:
@@ -130,6 +126,23 @@ def test_parts_of_a_video(tmp_path: Path, clip: Clip, expected: list[int]) -> No
 def test_a_time_is_met_to_six_places(tmp_path: Path, clip: Clip, indices: list[int]) -> None:
     path = video(tmp_path / "a.mp4", frames=5, rate=3)
     assert [frame.index for frame in VideoReader(path, clip)] == indices
+
+
+@pytest.mark.parametrize(
+    ("form", "codec", "pixels"),
+    [("h264", "libx264", "yuv420p"), ("mjpeg", "mjpeg", "yuvj420p"), ("mpegts", "libx264", "yuv420p")],
+    ids=["no time stamps", "no first time stamp", "nothing to decode behind the last key frame"],
+)
+def test_a_part_is_that_of_the_whole_where_seeking_leads_astray(
+    tmp_path: Path, form: str, codec: str, pixels: str
+) -> None:
+    path = tmp_path / "video"
+    path.write_bytes(encoded(0, 20, form, codec, pixels=pixels, key_every=12))
+    whole = [(index_of(frame), frame.index, frame.timestamp) for frame in VideoReader(path)]
+    assert [index for index, _, _ in whole] == list(range(20))
+    for first in (7, 18):
+        part = VideoReader(path, Clip(start=whole[first][2] or 0.0))
+        assert [(index_of(frame), frame.index, frame.timestamp) for frame in part] == whole[first:]
 
 
 def test_a_variable_frame_rate_is_kept(tmp_path: Path) -> None:
@@ -671,7 +684,8 @@ def test_matroska_that_states_a_rate_it_does_not_keep_is_counted(tmp_path: Path,
 
 
 def test_frames_without_time_stamps_come_at_the_rate_of_the_stream(tmp_path: Path) -> None:
-    path = encoded(tmp_path / "a.h264", "libx264", 8)
+    path = tmp_path / "a.h264"
+    path.write_bytes(encoded(0, 8, "h264", "libx264", key_every=12))
     for clip, indices in ((Clip(), range(8)), (Clip(start=0.4), range(4, 8))):
         frames = list(VideoReader(path, clip))
         assert [index_of(frame) for frame in frames] == [frame.index for frame in frames] == list(indices)
@@ -681,7 +695,8 @@ def test_frames_without_time_stamps_come_at_the_rate_of_the_stream(tmp_path: Pat
 def test_frames_that_avi_stores_in_another_order_than_they_are_shown_in_have_their_times(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    path = encoded(tmp_path / "a.avi", "libx264", 20, gop=5, b_frames=3)
+    path = tmp_path / "a.avi"
+    path.write_bytes(encoded(0, 20, "avi", "libx264", key_every=5, b_frames=3))
     for clip, indices in ((Clip(), range(20)), (Clip(start=1.2), range(12, 20))):
         frames = list(VideoReader(path, clip))
         assert [index_of(frame) for frame in frames] == [frame.index for frame in frames] == list(indices)
@@ -690,7 +705,9 @@ def test_frames_that_avi_stores_in_another_order_than_they_are_shown_in_have_the
 
 
 def test_what_is_well_before_the_start_is_not_read(tmp_path: Path) -> None:
-    reader = VideoReader(encoded(tmp_path / "a.mp4", "mpeg4", 20, gop=5), Clip(start=1.2))
+    path = tmp_path / "a.mp4"
+    path.write_bytes(encoded(0, 20, "mp4", "mpeg4", key_every=5))
+    reader = VideoReader(path, Clip(start=1.2))
     assert next(reader._decode())[0] == 1.0
     assert [frame.index for frame in reader] == list(range(12, 20))
 

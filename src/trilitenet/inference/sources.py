@@ -242,24 +242,26 @@ class VideoReader(FrameReader):
         return _open_container(self._path, self.name, timeout=self._timeout)
 
     def _decode(self) -> Any:
-        astray, broken = False, self.broken
+        broken = self.broken
         with self._open() as container:
-            sought = bool(self.clip.start) and self._path != "-" and not container.format.flags & _NO_TIMESTAMPS
-            if sought:
+            first: int | None = None
+            if self.clip.start and self._path != "-":
                 stream = container.streams.video[0]
-                first = stream.start_time or 0
+                first = stream.start_time  # without one (H.264, JPEGs as such) nobody knows where a seek has led
+            astray = first is not None
+            if first is not None:
                 with contextlib.suppress(_av().FFmpegError):  # what cannot seek is read from its beginning
                     container.seek(first + int(self.clip.start / stream.time_base), stream=stream)
             frames = _frames_of(container, self)
             for timestamp, make in itertools.islice(frames, 1):
-                if sought:  # the broken frames before it are counted besides
+                if first is not None:  # the broken frames before it are counted besides
                     self._skipped = round(timestamp * (self.rate or 0)) - (self.broken - broken)
-                astray = sought and timestamp > self.clip.start + _SLACK
+                    astray = timestamp > self.clip.start + _SLACK
                 if not astray:
                     yield timestamp, make
             if not astray:
                 yield from frames
-        if astray:  # as in recordings one after the other, whose time stamps begin anew
+        if astray:  # as in recordings one after the other, whose time stamps begin anew, or behind the last key frame
             self._skipped, self.broken = 0, broken
             with self._open() as container:
                 yield from _frames_of(container, self)
