@@ -274,7 +274,7 @@ class StreamReader(FrameReader):
     """A live stream by URL (RTSP, HTTP, RTMP, UDP ...), picked up again when it breaks or ends.
 
     After a break it waits ``backoff`` seconds, then twice as long each time, up to ``longest``; a frame that arrives
-    starts the count anew. Time stamps go on over a break by the clock.
+    starts the count anew. Time stamps go on over a break by the clock, or after the last frame if that is later.
 
     Args:
         url: The address.
@@ -306,6 +306,7 @@ class StreamReader(FrameReader):
 
     def _decode(self) -> Any:
         began: float | None = None
+        following = 0.0
         attempt, connected = 0, False
         reason = "no frames came"
         while attempt <= self.retries:
@@ -318,12 +319,14 @@ class StreamReader(FrameReader):
             try:
                 with _open_container(self._url, self.name, timeout=_PATIENCE) as container:
                     offset: float | None = None
+                    step = _step(container, self)
                     for timestamp, make in _frames_of(container, self):
                         if offset is None:
                             began = time.monotonic() if began is None else began
-                            offset = time.monotonic() - began - timestamp
+                            offset = max(time.monotonic() - began, following) - timestamp
                             self.reconnections += connected
                             connected, attempt = True, 1
+                        following = timestamp + offset + step
                         yield timestamp + offset, make
                 reason = "the stream ended"
             except InputError as error:
@@ -631,7 +634,7 @@ def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
     """
     av = _av()
     stream = container.streams.video[0]
-    step = 1 / (reader.rate or _rate_of(container) or 30.0)
+    step = _step(container, reader)
     first = float(stream.start_time * stream.time_base) if stream.start_time is not None else None
     last = -step
     end = 0.0
@@ -692,6 +695,11 @@ def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
             length = stream.frames * step if stream.frames < _UNKNOWN else 0.0
         if length - end > max(0.02 * length, min(1, 5 * step)):
             _LOGGER.warning("%s: ends after %.1f s of %.1f s; the file may be cut off", reader.name, end, length)
+
+
+def _step(container: Any, reader: FrameReader) -> float:
+    """Return about how many seconds lie between two frames."""
+    return 1 / (reader.rate or _rate_of(container) or 30.0)
 
 
 def _upright(frame: Any) -> NDArray[np.uint8]:
