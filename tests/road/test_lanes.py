@@ -43,6 +43,13 @@ def test_two_straight_lines_and_their_place() -> None:
         assert line.points[0, 1] > line.points[-1, 1]
 
 
+def test_a_line_keeps_its_rows_where_the_height_is_no_multiple_of_the_scale() -> None:
+    (line,) = find_lines(paint(straight(133, 2133, (1438, 720)), size=(1439, 2560), thickness=12))
+    rows = np.linspace(800, 1400, 20)
+    missed = line.column(rows) - (133 + (1438 - rows) / 718 * 2000)
+    assert abs(missed.mean()) < 0.7
+
+
 def test_a_curve_that_bends_towards_the_horizon() -> None:
     v = np.linspace(383, 185, 60)
     u = 200 + 0.4 * (383 - v) + 1500 / (v - 165)

@@ -95,8 +95,8 @@ def find_lines(mask: NDArray[np.bool_] | NDArray[np.uint8]) -> list[LaneLine]:
     if scale > 1.0:
         size = (WORK_WIDTH, max(1, round(height / scale)))
         small = (np.asarray(cv2.resize(small * 255, size, interpolation=cv2.INTER_AREA)) > 127).astype(np.uint8)
-    pieces = _link(small)
-    lines = [line for chain in _join(pieces) if (line := _fit(chain, scale, small.shape[0])) is not None]
+    scales = (scale, height / small.shape[0])  # which differ where the height is no multiple
+    lines = [line for chain in _join(_link(small)) if (line := _fit(chain, scales, small.shape[0])) is not None]
     lines.sort(key=lambda line: -line.confidence)
     kept: list[LaneLine] = []
     for line in lines:
@@ -237,8 +237,14 @@ def _join(pieces: list[_Piece]) -> list[list[_Piece]]:
     return chains
 
 
-def _fit(chain: list[_Piece], scale: float, height: int) -> LaneLine | None:
-    """Return the curve through a chain of pieces; None if it is too short or fits badly."""
+def _fit(chain: list[_Piece], scales: tuple[float, float], height: int) -> LaneLine | None:
+    """Return the curve through a chain of pieces; None if it is too short or fits badly.
+
+    Args:
+        chain: Pieces of a mask as it was searched.
+        scales: Columns and rows of the picture to one of that mask.
+        height: Rows of that mask.
+    """
     rows = np.concatenate([piece.rows for piece in chain]).astype(np.float64)
     columns = np.concatenate([piece.centres for piece in chain])
     widths = np.concatenate([piece.widths for piece in chain])
@@ -270,16 +276,17 @@ def _fit(chain: list[_Piece], scale: float, height: int) -> LaneLine | None:
     low_rows, high_rows = max(0.0, rows[0] - max(half, rows[-1])), max(0.0, min(half, rows[0]) - rows[-1])
     covered = min(1.0, count / (1 + high_rows / ROW_STEPS[0] + low_rows / ROW_STEPS[1]))
     confidence = min(1.0, span / (0.22 * height)) ** 0.5 * (0.4 + 0.6 * covered) * math.exp(-residual / 3.0)
+    across, down = scales
     polynomial = np.zeros(DEGREE + 1)
-    polynomial[: degree + 1] = solution * scale
-    polynomial[0] += (scale - 1) / 2
-    low, high = (row * scale + (scale - 1) / 2 for row in (rows[0], rows[-1]))
+    polynomial[: degree + 1] = solution * across
+    polynomial[0] += (across - 1) / 2
+    low, high = (row * down + (down - 1) / 2 for row in (rows[0], rows[-1]))
     origin = (low, high - low)
     sampled = np.linspace(0.0, 1.0, int(np.clip(tall // 6, 4, 24)))
     points = np.stack(
         [np.vander(sampled, DEGREE + 1, increasing=True) @ polynomial, low + sampled * (high - low)], axis=1
     )
-    return LaneLine(0, 0, points.astype(np.float32), polynomial, origin, residual * scale, confidence)
+    return LaneLine(0, 0, points.astype(np.float32), polynomial, origin, residual * across, confidence)
 
 
 def _same(line: LaneLine, other: LaneLine, scale: float) -> bool:
