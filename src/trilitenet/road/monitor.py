@@ -124,7 +124,7 @@ class RoadMonitor:
             camera, errors = calibration.camera, calibration.errors
         # Where this frame's lanes surely vanish elsewhere, the car pitches: what rests on the horizon is less sure.
         seen = vanishing_point(lines, camera.size, camera)
-        if seen is not None and seen.lines >= 2:
+        if seen is not None:
             away = abs(seen.v - camera.vanishing_point()[1])
             if away > 3 * seen.error:
                 errors = dataclasses.replace(errors, pitch=max(errors.pitch, away / camera.fy))

@@ -83,7 +83,7 @@ class LaneLine:
         points: (N, 2) float32 u, v on the curve in pixels, from near (bottom) to far.
         polynomial: (6,) float64: u = p0 + p1 t + ... + p5 t^5 with t = (v - v0) / span.
         origin: (v0, span): t is 0 at the nearest row and 1 at the farthest.
-        residual: Root mean square distance in u of the mask's middle from the curve, in pixels.
+        residual: Root mean square distance of the mask's middle from the curve, across it, in pixels.
         confidence: In [0, 1]: how much of the curve the mask covers, how long it is and how well it fits.
         ground: The line in metres; None without a trusted camera.
     """
