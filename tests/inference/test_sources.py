@@ -459,6 +459,17 @@ def test_a_stream_that_dies_twice_is_picked_up(caplog: pytest.LogCaptureFixture)
     assert "token" not in frames[0].source
 
 
+def test_the_times_of_a_camera_that_sends_jpegs_are_the_clock_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(100 + 0.5 * i for i in range(100))  # far from the 25 frames a second that FFmpeg supposes
+    monkeypatch.setattr("trilitenet.inference.sources.time", types.SimpleNamespace(monotonic=lambda: next(clock)))
+    buffer = io.BytesIO()
+    Image.fromarray(shade(1)).save(buffer, "jpeg")
+    part = b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%s\r\n"
+    with Server([part % (len(buffer.getvalue()), buffer.getvalue()) * 4]) as server:
+        times = [frame.timestamp for frame in StreamReader(server.url, retries=0)]
+    assert times == [0.5, 1.0, 1.5, 2.0]
+
+
 def test_a_stream_that_never_comes_is_an_error_at_once() -> None:
     with Server([]) as server, pytest.raises(InputError, match=r"http://127\.0\.0\.1:\d+/live\.ts: is not a video"):
         list(StreamReader(server.url, backoff=60))

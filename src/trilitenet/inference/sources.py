@@ -65,7 +65,7 @@ _WITH_LENGTH: Final = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "flv",
 """FFmpeg's names of the containers that state their length, which of others is found from what is there."""
 _INDEX_FIRST: Final = "its index comes first: ffmpeg -i IN -c copy -movflags +faststart OUT"
 _NO_TIMESTAMPS: Final = 0x80
-"""FFmpeg's flag of formats without time stamps, such as raw H.264, in which no time can be found."""
+"""FFmpeg's flag of formats without time stamps, such as raw H.264, to whose frames it gives 25 a second."""
 _UNKNOWN: Final = 1 << 30
 """Frames that FFmpeg states in an AVI whose beginning it could not write again, as in a pipe."""
 _Decoded: TypeAlias = tuple[float, Callable[[], NDArray[np.uint8]]]
@@ -274,7 +274,8 @@ class StreamReader(FrameReader):
     """A live stream by URL (RTSP, HTTP, RTMP, UDP ...), picked up again when it breaks or ends.
 
     After a break it waits ``backoff`` seconds, then twice as long each time, up to ``longest``; a frame that arrives
-    starts the count anew. Time stamps go on over a break by the clock, or after the last frame if that is later.
+    starts the count anew. Time stamps go on over a break by the clock, or after the last frame if that is later. Those of
+    a stream that has none (JPEGs of a network camera, H.264 as such) are the clock's.
 
     Args:
         url: The address.
@@ -319,13 +320,16 @@ class StreamReader(FrameReader):
             try:
                 with _open_container(self._url, self.name, timeout=_PATIENCE) as container:
                     offset: float | None = None
-                    step = _step(container, self)
+                    timeless = bool(container.format.flags & _NO_TIMESTAMPS)
+                    step = 0.0 if timeless else _step(container, self)
                     for timestamp, make in _frames_of(container, self):
+                        if began is None:
+                            began = time.monotonic()
                         if offset is None:
-                            began = time.monotonic() if began is None else began
-                            offset = max(time.monotonic() - began, following) - timestamp
                             self.reconnections += connected
                             connected, attempt = True, 1
+                        if offset is None or timeless:
+                            offset = max(time.monotonic() - began, following) - timestamp
                         following = timestamp + offset + step
                         yield timestamp + offset, make
                 reason = "the stream ended"
