@@ -218,7 +218,7 @@ def test_damaged_best_weights_are_replaced_and_stop_no_run(tmp_path: Path, left:
     path.write_bytes(path.read_bytes()[:left])
     later = trainer(tmp_path, batches=1, max_steps=2, validate=lambda _network, _show: next(figures))
     shown: list[str] = []
-    later._show = shown.append  # type: ignore[method-assign]
+    later._show = shown.append  # type: ignore[assignment, method-assign]
     result, _ = fit(later, resume=True)
     assert shown[0] == f"{path}: is damaged; the next validation replaces it"
     assert result.best == {"lane": 0.4, "drivable": 0.5, "overall": pytest.approx(0.55)}

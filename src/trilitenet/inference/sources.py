@@ -274,8 +274,8 @@ class StreamReader(FrameReader):
     """A live stream by URL (RTSP, HTTP, RTMP, UDP ...), picked up again when it breaks or ends.
 
     After a break it waits ``backoff`` seconds, then twice as long each time, up to ``longest``; a frame that arrives
-    starts the count anew. Time stamps go on over a break by the clock, or after the last frame if that is later. Those of
-    a stream that has none (JPEGs of a network camera, H.264 as such) are the clock's.
+    starts the count anew. Time stamps go on over a break by the clock, or after the last frame if that is later. Those
+    of a stream that has none (JPEGs of a network camera, H.264 as such) are the clock's.
 
     Args:
         url: The address.
