@@ -255,7 +255,7 @@ class Claim:
 
     def __init__(self, path: Path) -> None:
         part, number = part_of(path), None
-        taken = OutputError(f"{path}: it is being written already; wait for its end, or choose another --output")
+        taken = OutputError(f"{path}: it is being written already; wait for its end, or choose another output")
         while fcntl is not None and number is None:
             try:
                 number = os.open(part, os.O_RDWR | os.O_CREAT, 0o666)

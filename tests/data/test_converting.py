@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import shutil
@@ -25,7 +26,7 @@ from trilitenet.data.records import (
     ObjectLabel,
     RowRuns,
 )
-from trilitenet.errors import ConfigError, DataError, OutputError
+from trilitenet.errors import Claim, ConfigError, DataError, OutputError
 from trilitenet.formats.readers.bdd100k import BddSource, read_bdd100k
 
 Tree = dict[str, tuple[bytes, int]]
@@ -92,6 +93,10 @@ def test_interrupted_and_run_again_ends_the_same(raw: Path, tmp_path: Path, afte
     (tmp_path / "parts/images/train/.c05.jpg.part").write_bytes(b"half")
     (tmp_path / "parts/ll_seg_annotations/train/c19.png").write_bytes(b"half")
     (tmp_path / "parts/ll_seg_annotations/train/c19.png").unlink()
+    with contextlib.closing(Claim(tmp_path / "parts/conversion.json")):  # of the same call elsewhere
+        with pytest.raises(OutputError, match="is being written already"):
+            convert(read_bdd100k(raw), tmp_path / "parts")
+        assert (tmp_path / "parts/images/train/.c05.jpg.part").exists()
     again = convert(read_bdd100k(raw), tmp_path / "parts")
     one, two = tree(tmp_path / "whole", times=False), tree(tmp_path / "parts", times=False)
     two["dataset.yaml"] = (two["dataset.yaml"][0].replace(b"name: parts", b"name: whole"), 0)

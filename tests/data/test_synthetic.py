@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -20,7 +21,7 @@ from trilitenet.data.synthetic_files import annotation, write_dataset
 from trilitenet.data.synthetic_render import FIRST_VEHICLE, render
 from trilitenet.data.synthetic_vehicles import VehiclePose
 from trilitenet.data.synthetic_world import Course, Vehicle
-from trilitenet.errors import ConfigError, OutputError
+from trilitenet.errors import Claim, ConfigError, OutputError
 
 SIZE = (192, 320)
 
@@ -210,6 +211,10 @@ def test_the_same_call_goes_on_where_one_was_interrupted(tmp_path: Path, workers
     (root / "images/val/.synthetic_3.01234567.part").write_bytes(b"half")
     with pytest.raises(OutputError, match=r"images/val is not empty, and not what the same command left"):
         call(root, count=5)
+    with contextlib.closing(Claim(root / ".synthesis-val.json")):  # of the same call elsewhere
+        with pytest.raises(OutputError, match=r"val\.json: it is being written already"):
+            call(root)
+        assert (root / "images/val/.synthetic_3.01234567.part").exists()
     call(root, workers=workers)
     assert files(root) == files(tmp_path / "whole")
     assert first.stat().st_mtime_ns == before

@@ -55,7 +55,7 @@ from trilitenet.data.records import (
     RunLabel,
     image_size,
 )
-from trilitenet.errors import ConfigError, DataError, OutputError, replacing, writing
+from trilitenet.errors import Claim, ConfigError, DataError, OutputError, replacing, writing
 from trilitenet.processing.cores import ProcessPool
 from trilitenet.processing.images import BROKEN, open_image
 
@@ -79,6 +79,7 @@ _CORNERS: Final = 3
 """An area with fewer has no pixel."""
 
 _STATE_FOLDER: Final = ".conversion"
+_REPORT_FILE: Final = "conversion.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,7 +171,7 @@ def convert(
 
     Raises:
         OutputError: If ``out`` holds something else, or a conversion with other options or of another source; or if it
-            cannot be written.
+            cannot be written, or is being written by another call.
         DataError: If a split is unknown, or its name not that of one folder.
     """
     options = options or ConversionOptions()
@@ -190,7 +191,9 @@ def convert(
     finished = 0
     if progress:
         progress(finished, total)
-    with writing(root):
+    with writing(root), contextlib.closing(Claim(root / _REPORT_FILE)):
+        for part in root.rglob(".*.part"):  # of a run that was killed
+            part.unlink()
         for split, wanted in names.items():
             for _ in _convert_split(source, split, wanted, root, options, workers):
                 finished += 1
@@ -557,8 +560,6 @@ def _open_state(root: Path, options: ConversionOptions, origin: Mapping[str, str
             raise OutputError(
                 f"{root}: holds a conversion with other options or another source; choose another folder or remove it"
             )
-        for part in root.rglob(".*.part"):
-            part.unlink()
         return state
     if root.is_dir() and any(child != state for child in root.iterdir()):  # the state may have failed to be written
         raise OutputError(f"{root}: is not empty and not of an earlier conversion; choose another folder")
@@ -676,7 +677,7 @@ def _finish(
     writer.writeheader()
     writer.writerows(rows)
     _write(root / "index.csv", text.getvalue())
-    _write(root / "conversion.json", json.dumps(report.to_dict(), indent=1, sort_keys=True))
+    _write(root / _REPORT_FILE, json.dumps(report.to_dict(), indent=1, sort_keys=True))
     values = {255: "direct", ALTERNATIVE_VALUE: "alternative"} if options.keep_alternative else {255: "drivable"}
     default = DatasetDescription()
     given = vars(description or default).items()

@@ -17,7 +17,7 @@ from trilitenet.data.description import DESCRIPTION_FILE, DatasetDescription, is
 from trilitenet.data.reading import FOLDERS, IMAGE_FOLDER, label_file
 from trilitenet.data.sample import Sample
 from trilitenet.data.synthetic import LaneLabels, SyntheticScenes
-from trilitenet.errors import ConfigError, OutputError, replacing
+from trilitenet.errors import Claim, ConfigError, OutputError, replacing, writing
 from trilitenet.processing.cores import ProcessPool
 
 __all__ = ["annotation", "write_dataset", "write_sample"]
@@ -54,7 +54,8 @@ def write_dataset(
     Raises:
         ConfigError: If ``count`` or ``workers`` is under 1, the seed negative, the size too small, or ``split`` no name
             of one folder.
-        OutputError: If the split exists already, whole or of another call, or a file cannot be written.
+        OutputError: If the split exists already, whole or of another call, a file cannot be written, or the same call
+            is being made elsewhere.
     """
     if count < 1 or workers < 1:
         raise ConfigError(f"count and workers must be at least 1, got {count} and {workers}")
@@ -72,8 +73,10 @@ def write_dataset(
             f"{images} is not empty, and not what the same command left when it was interrupted; "
             "choose another folder or split, or remove it"
         )
-    try:
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(writing(root))
         root.mkdir(parents=True, exist_ok=True)
+        stack.enter_context(contextlib.closing(Claim(state)))
         with replacing(state) as part:
             part.write_bytes(call)
         for folder in FOLDERS:
@@ -92,17 +95,14 @@ def write_dataset(
                 ),
             )
         job = functools.partial(_write_scene, root, split, seed, size, labels, count)
-        with contextlib.ExitStack() as stack:
-            if workers == 1:
-                scenes: Iterator[None] = map(job, range(count))
-            else:
-                scenes = stack.enter_context(ProcessPool(workers)).map(job, range(count), chunksize=4)
-            for done, _ in enumerate(scenes, start=1):
-                if progress:
-                    progress(done, count)
+        if workers == 1:
+            scenes: Iterator[None] = map(job, range(count))
+        else:
+            scenes = stack.enter_context(ProcessPool(workers)).map(job, range(count), chunksize=4)
+        for done, _ in enumerate(scenes, start=1):
+            if progress:
+                progress(done, count)
         state.unlink()
-    except OSError as error:
-        raise OutputError(f"{root}: cannot write ({error})") from error
 
 
 def _write_scene(
