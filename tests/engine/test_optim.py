@@ -21,6 +21,12 @@ def test_warm_up_then_cosine_to_the_final_rate() -> None:
     assert all(later < earlier for earlier, later in itertools.pairwise(rates[10:]))
 
 
+@pytest.mark.parametrize("steps", [100, 1000])
+def test_a_run_that_is_all_warm_up_never_has_the_initial_rate(steps: int) -> None:
+    schedule = Schedule(steps, warmup=steps, lr=1.0, final=0.2)
+    assert 0.30 < max(map(schedule.rate, range(steps))) < 0.31
+
+
 def test_stairs_keep_the_rate_within_an_epoch() -> None:
     schedule = Schedule(steps=100, warmup=0, lr=1.0, final=0.2, stair=25)
     assert schedule.rate(24) == schedule.rate(0) == 1.0

@@ -49,7 +49,7 @@ def build_optimiser(
 
 @dataclasses.dataclass(frozen=True)
 class Schedule:
-    """Learning rate of a step: linear warm-up, then a cosine from 1 to ``final`` of the initial rate.
+    """Learning rate of a step: a cosine from 1 to ``final`` of the initial rate, times a linear warm-up at its start.
 
     Attributes:
         steps: Optimiser steps of the run.
