@@ -26,7 +26,7 @@ table { border-collapse: collapse; } th, td { padding: .25rem .8rem .25rem 0; te
 border-bottom: 1px solid var(--line); } td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
 code { font-size: .85em; } .bad { color: var(--bad); font-weight: 600; } .good { color: var(--good); font-weight: 600; }
 .plots { display: flex; flex-wrap: wrap; gap: 1.5rem; } figure { margin: 0; } figcaption { font-size: .85rem; }
-img { display: block; max-width: 100%; } .scroll { overflow-x: auto; }
+img, svg { display: block; max-width: 100%; height: auto; } .scroll { overflow-x: auto; }
 svg text { font: 11px system-ui, sans-serif; fill: currentColor; }
 """
 _MOST_ROWS: Final = 65_000
@@ -171,7 +171,7 @@ def _bars(series: Mapping[str, Mapping[str, int]]) -> str:
                 f'<text x="{x + 14}" y="{y + 9}">{_text(name)}</text>'
             )
         y += 16
-    return f'<svg width="{left + width + 60}" height="{y + 4}">{"".join(parts)}</svg>'
+    return _svg(left + width + 60, y + 4, parts)
 
 
 def _box_plot(sizes: Sequence[tuple[float, float]]) -> str:
@@ -192,7 +192,12 @@ def _box_plot(sizes: Sequence[tuple[float, float]]) -> str:
         for width, height in level:
             x, y = margin + place(width), side + 4 - place(height)
             parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="none" stroke="var(--two)" stroke-width="2"/>')
-    return f'<svg width="{side + margin + 8}" height="{side + 26}">{"".join(parts)}</svg>'
+    return _svg(side + margin + 8, side + 26, parts)
+
+
+def _svg(width: int, height: int, parts: Iterable[str]) -> str:
+    """Return a drawing of so many pixels, which gets smaller where the page is narrower."""
+    return f'<svg width="{width}" height="{height}" viewBox="0 0 {width} {height}">{"".join(parts)}</svg>'
 
 
 def _box_caption(report: CheckReport) -> str:
