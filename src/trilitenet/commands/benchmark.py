@@ -9,7 +9,6 @@ import json
 import math
 import os
 import platform
-import re
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -21,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trilitenet
+from trilitenet.commands.energy import energy_meters
 from trilitenet.commands.load import check_parallel, load
 from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, one_for_several, optional_path
 from trilitenet.config import VARIANTS, check_size
@@ -50,8 +50,8 @@ class Timing:
         frames_per_second: Images a second at the median.
         ratio: Median over the rounds of the first entry's time an image over this one's: above 1 is faster.
         first_result: Seconds from loading the model to its first result.
-        joules: A frame, of the GPU where the runtime is on one, else of the processor package; None where it cannot be
-            read.
+        joules: A frame, of the GPU where the runtime is on one, else of the processor package; of a Jetson, the whole
+            module's. None where it cannot be read.
         watts: Mean over the measurement; None likewise.
     """
 
@@ -259,21 +259,21 @@ class _Call:
 
 
 def _measure(calls: Sequence[_Call], rounds: int, warmup: int) -> tuple[Timing, ...]:
-    meters = [_meter(call.entry.predictor.backend.name) for call in calls]
-    for call in calls:
-        call.once()
-    for _ in range(warmup):
+    with energy_meters([call.entry.predictor.backend.name for call in calls]) as meters:
         for call in calls:
-            call.run()
-    for _ in range(rounds):
-        for call, meter in zip(calls, meters, strict=True):
-            before = meter()
-            started = time.perf_counter()
-            call.run()
-            call.milliseconds.append(1e3 * (time.perf_counter() - started))
-            after = meter()
-            if before is not None and after is not None and after >= before:
-                call.joules.append(after - before)
+            call.once()
+        for _ in range(warmup):
+            for call in calls:
+                call.run()
+        for _ in range(rounds):
+            for call, meter in zip(calls, meters, strict=True):
+                before = meter()
+                started = time.perf_counter()
+                call.run()
+                call.milliseconds.append(1e3 * (time.perf_counter() - started))
+                after = meter()
+                if before is not None and after is not None and after >= before:
+                    call.joules.append(after - before)
     first = np.array(calls[0].milliseconds) / calls[0].batch
     timings = []
     for call in calls:
@@ -298,32 +298,6 @@ def _measure(calls: Sequence[_Call], rounds: int, warmup: int) -> tuple[Timing, 
             )
         )
     return tuple(timings)
-
-
-def _meter(backend: str) -> Callable[[], float | None]:
-    """Return what reads the joules since some time of what a backend runs on, or None where they cannot be read.
-
-    That is the GPU (by NVML) where the backend's name has it, else the processor package (by RAPL).
-    """
-    on_gpu = re.search(r"cuda:?(\d*)", backend)
-    if on_gpu is None:
-        for rapl in sorted(Path("/sys/class/powercap").glob("*-rapl:0/energy_uj")):
-            if os.access(rapl, os.R_OK):
-                return lambda: int(rapl.read_text(encoding="ascii")) / 1e6
-        return lambda: None
-    try:
-        import pynvml
-
-        pynvml.nvmlInit()
-        gpu = pynvml.nvmlDeviceGetHandleByIndex(int(on_gpu[1] or 0))
-        pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu)  # older GPUs refuse
-    except (ImportError, OSError, RuntimeError):
-        return lambda: None
-    except Exception as error:  # NVML's own errors derive from Exception alone
-        if type(error).__module__ != "pynvml":
-            raise
-        return lambda: None
-    return lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3
 
 
 def _machine(threads: int | None, streams: int) -> dict[str, str]:

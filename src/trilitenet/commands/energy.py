@@ -1,0 +1,141 @@
+"""Energy of what a model runs on, from whatever the machine has to tell it."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Final, TypeAlias
+
+__all__ = ["Meter", "energy_meters"]
+
+Meter: TypeAlias = Callable[[], float | None]
+"""Returns the joules since some time, or None where they cannot be read."""
+
+_RAIL: Final = re.compile(r"\b([A-Z]\w*) (\d+)(?:mW)?/\d+(?:mW)?(?!\S)")
+"""A rail of `tegrastats`: its name, its milliwatts and their mean, with units or without."""
+_INTERVAL: Final = 100
+"""Milliseconds between two of its lines."""
+_PATIENCE: Final = 3.0
+"""Seconds in which the first must come."""
+
+
+@contextmanager
+def energy_meters(backends: Sequence[str]) -> Iterator[list[Meter]]:
+    """Read, while inside, the energy of what each backend runs on.
+
+    That is the GPU (by NVML) where the backend's name has it, else the processor package (by RAPL); where these tell
+    nothing, the board of a Jetson (by `tegrastats`).
+
+    Args:
+        backends: Their names, such as ``"torch cuda:1"``.
+
+    Yields:
+        A meter for each.
+    """
+    with ExitStack() as stack:
+        board: list[Meter] = []
+        meters: list[Meter] = []
+        for backend in backends:
+            on_gpu = re.search(r"cuda:?(\d*)", backend)
+            meter = _package() if on_gpu is None else _gpu(int(on_gpu[1] or 0))
+            if meter is None:
+                if not board:
+                    board.append(_board(stack))
+                meter = board[0]
+            meters.append(meter)
+        yield meters
+
+
+def _package() -> Meter | None:
+    for rapl in sorted(Path("/sys/class/powercap").glob("*-rapl:0/energy_uj")):
+        if os.access(rapl, os.R_OK):
+            return lambda: int(rapl.read_text(encoding="ascii")) / 1e6
+    return None
+
+
+def _gpu(index: int) -> Meter | None:
+    try:
+        import pynvml
+
+        pynvml.nvmlInit()
+        gpu = pynvml.nvmlDeviceGetHandleByIndex(index)
+        pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu)  # older GPUs and Jetsons refuse
+    except (ImportError, OSError, RuntimeError):
+        return None
+    except Exception as error:  # NVML's own errors derive from Exception alone
+        if type(error).__module__ != "pynvml":
+            raise
+        return None
+    return lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3
+
+
+def _board(stack: ExitStack) -> Meter:
+    program = shutil.which("tegrastats")
+    return (lambda: None) if program is None else stack.enter_context(_Board(program)).read
+
+
+class _Board:
+    """The energy of a Jetson: the power that `tegrastats` tells, which holds until it tells another."""
+
+    def __init__(self, program: str) -> None:
+        self._lock = threading.Lock()
+        self._told = threading.Event()
+        self._joules, self._watts, self._since = 0.0, 0.0, 0.0
+        self._process = subprocess.Popen(
+            [program, "--interval", str(_INTERVAL)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
+        self._thread = threading.Thread(target=self._follow, daemon=True)
+
+    def __enter__(self) -> _Board:
+        self._thread.start()
+        self._told.wait(_PATIENCE)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.wait()
+        self._thread.join()
+
+    def read(self) -> float | None:
+        """Return the joules since the first line, or None before it and after the last."""
+        with self._lock:
+            if not self._told.is_set():
+                return None
+            return self._joules + self._watts * (time.perf_counter() - self._since)
+
+    def _follow(self) -> None:
+        assert self._process.stdout is not None
+        with self._process.stdout as lines:
+            for line in lines:
+                watts = _board_watts(line)
+                if watts is None:
+                    continue
+                with self._lock:
+                    now = time.perf_counter()
+                    self._joules += self._watts * (now - self._since)
+                    self._watts, self._since = watts, now
+                    self._told.set()
+        with self._lock:
+            self._told.clear()  # it has ended, and nobody knows the power from here on
+
+
+def _board_watts(line: str) -> float | None:
+    """Return the power of the whole module that a line of `tegrastats` tells; None without rails.
+
+    It is that of the rail which feeds the others (VDD_IN, POM_5V_IN); on the AGX modules, which have none, the sum,
+    less VDDQ, which VIN_SYS_5V0 feeds.
+    """
+    rails = {name: int(milliwatts) for name, milliwatts in _RAIL.findall(line)}
+    if not rails:
+        return None
+    total = next((power for name, power in rails.items() if name.endswith("_IN")), None)
+    if total is None:
+        total = sum(power for name, power in rails.items() if not name.startswith("VDDQ_"))
+    return total / 1e3
