@@ -14,7 +14,7 @@ from PIL import Image
 
 from tests.formats.readers import raw_bdd
 from trilitenet.data.converting import ConversionOptions, convert, drivable_mask, lane_mask
-from trilitenet.data.description import DatasetDescription, read_description
+from trilitenet.data.description import DatasetDescription, MaskMeaning, read_description
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.records import (
     AreaLabel,
@@ -296,6 +296,11 @@ def test_what_was_added_to_the_description_stays(tmp_path: Path) -> None:
     about = read_description(tmp_path / "out")
     assert (about.ego_mask, about.tasks) == ("bonnet.png", ("detection",))
     assert (about.name, about.licence, about.splits) == ("out", "CC0", ("train", "val"))
+    text = (tmp_path / "out/dataset.yaml").read_text().replace("above: 1\n", "above: 100\n", 1)
+    (tmp_path / "out/dataset.yaml").write_text(text.replace("ignore: []\n", "ignore: [127]\n", 1))
+    ignored = picture(tmp_path / "raw/b.png", drivable=(AreaLabel("ignore", np.zeros((3, 2))),))
+    convert(Records(train=[first, ignored]), tmp_path / "out")
+    assert read_description(tmp_path / "out").drivable == MaskMeaning(100, {255: "drivable"}, (64, 127))
 
 
 def test_splits_without_images_are_left_out(tmp_path: Path) -> None:

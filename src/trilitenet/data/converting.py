@@ -690,9 +690,15 @@ def _finish(
             "ignore": options.ignore,
             "splits": tuple(sorted(split for split, count in report.images.items() if count)),
             "attributes": tuple(sorted(columns)),
-            "drivable": MaskMeaning(values=values, ignore=ignore),
-            "lane": MaskMeaning(values={255: "lane marking"}, ignore=ignore),
+            "drivable": _meaning(before.drivable, values, ignore),
+            "lane": _meaning(before.lane, {255: "lane marking"}, ignore),
         },
     )
     if not (root / DESCRIPTION_FILE).is_file() or before != whole:
         write_description(root, whole)
+
+
+def _meaning(before: MaskMeaning, values: dict[int, str], ignore: tuple[int, ...]) -> MaskMeaning:
+    """Return what a mask's values mean, with the threshold and the ignored values that have been added by hand."""
+    added = tuple(value for value in before.ignore if value != IGNORE_VALUE)
+    return MaskMeaning(before.above, values, ignore + added)
