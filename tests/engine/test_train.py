@@ -211,14 +211,16 @@ def test_the_best_of_each_task_and_of_all_is_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("left", [0, 100])
-def test_damaged_best_weights_are_replaced_and_stop_no_run(tmp_path: Path, left: int) -> None:
+def test_damaged_best_weights_are_replaced_and_stop_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: int
+) -> None:
     figures = iter([{"lane/iou": 0.6, "drivable/miou": 0.5}, {"lane/iou": 0.4, "drivable/miou": 0.3}])
     fit(trainer(tmp_path, batches=1, max_steps=1, validate=lambda _network, _show: next(figures)))
     path = tmp_path / "best-lane.safetensors"
     path.write_bytes(path.read_bytes()[:left])
     later = trainer(tmp_path, batches=1, max_steps=2, validate=lambda _network, _show: next(figures))
     shown: list[str] = []
-    later._show = shown.append  # type: ignore[assignment, method-assign]
+    monkeypatch.setattr(later, "_show", shown.append)
     result, _ = fit(later, resume=True)
     assert shown[0] == f"{path}: is damaged; the next validation replaces it"
     assert result.best == {"lane": 0.4, "drivable": 0.5, "overall": pytest.approx(0.55)}

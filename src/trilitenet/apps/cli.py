@@ -98,8 +98,8 @@ _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 _HYPHEN: Final = "\0"
 """Stands for a lone hyphen, which the parser takes for an option without a name; no word that is typed holds it."""
 _ROOT_OPTIONS: Final = ("--help", "-h", "--version")
-_SPARING: Final = {"evaluate", "predict", "serve"}
-"""Commands that run a network without training it."""
+_SPARING: Final = {"evaluate", "evaluate-table", "predict", "serve"}
+"""Commands that run a network, neither to train it nor to measure how fast it is."""
 _SPINS: Final = "10000"
 """Turns for which a thread of PyTorch's spins while it waits for another, by default 300,000. Where other processes
 want the cores, the other waits for its own meanwhile; a training, which has them to itself, is 7% slower with fewer."""
