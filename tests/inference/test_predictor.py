@@ -106,6 +106,9 @@ def test_thresholds_come_from_the_card_or_the_caller() -> None:
     scene = coloured_scene()
     assert len(Predictor(ColourBackend())(scene).boxes or ()) == 1
     assert len(Predictor(ColourBackend(), Thresholds(confidence=0.95))(scene).boxes or ()) == 0
+    backend = ColourBackend()
+    backend.card = dataclasses.replace(backend.card, thresholds=Thresholds(confidence=0.95))
+    assert len(Predictor(backend)(scene).boxes or ()) == 0
 
 
 def test_errors() -> None:
