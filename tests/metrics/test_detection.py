@@ -187,6 +187,14 @@ def test_nothing_found_scores_zero() -> None:
     assert (scores.ap50, scores.recall_all, scores.at.f1) == (0.0, 0.0, 0.0)
 
 
+def test_the_best_f1_is_zero_where_nothing_is_found_and_undefined_without_objects() -> None:
+    truth = np.array([[0, 0, 10, 10]], np.float32)
+    for boxes, true, best in ((NO_BOXES, truth, 0.0), (truth + 50, truth, 0.0), (truth, NO_BOXES, np.nan)):
+        metric = DetectionMetric()
+        metric.update(boxes, np.full(len(boxes), 0.5), np.zeros(len(boxes), int), true, np.zeros(len(true), int))
+        assert metric.compute().best.f1 == pytest.approx(best, nan_ok=True)
+
+
 def test_confusion_tells_the_class_taken_for_another() -> None:
     box = np.array([[0, 0, 10, 10]], np.float32)
     metric = DetectionMetric(["car", "bus"])

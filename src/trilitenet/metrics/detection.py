@@ -440,7 +440,7 @@ class DetectionMetric:
             ap_medium=sizes["medium"],
             ap_large=sizes["large"],
             ap50_by_class={name: float(ap[number, 0]) for number, name in enumerate(self.class_names)},
-            best=_best_point(curve),
+            best=_best_point(curve) if objects.any() else OperatingPoint(*[float("nan")] * 4),
             at=OperatingPoint(self.confidence, **point),
             recall_all=float(curve.recall[-1]) if len(curve.recall) else (0.0 if objects.sum() else float("nan")),
         )
@@ -536,8 +536,8 @@ def _ap(sums: RankedSums, hit: NDArray[np.bool_], counted: NDArray[np.bool_], ob
 
 
 def _best_point(curve: DetectionCurve) -> OperatingPoint:
-    if not len(curve.confidence) or np.isnan(curve.recall).all():
-        return OperatingPoint(float("nan"), float("nan"), float("nan"), float("nan"))
+    if not len(curve.confidence):  # nothing is found, at any confidence
+        return OperatingPoint(float("nan"), float("nan"), 0.0, 0.0)
     f1 = np.nan_to_num(ratio(2 * curve.precision * curve.recall, curve.precision + curve.recall))
     best = int(f1.argmax())
     return OperatingPoint(
