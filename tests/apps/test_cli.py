@@ -76,6 +76,24 @@ def test_a_lone_hyphen_is_a_word_but_no_value_of_an_option(
     )
 
 
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        (["predict", ""], ""),
+        (["predict", "a.jpg", "--output", ""], "Invalid value for --output: "),
+        (["evaluate", "tiny", "--data="], "Invalid value for --data: "),
+        (["train", ""], ""),
+    ],
+)
+def test_an_empty_word_is_not_the_current_folder(
+    words: list[str], option: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(words) == 2
+    message = "an empty word names nothing; is a variable of the shell unset?"
+    assert capsys.readouterr().err == f"error: {option}{message} (see: trilitenet {words[0]} --help)\n"
+
+
 def test_a_result_is_shown_and_decides_the_exit_code(greet: list[object], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["greet", "two"]) == 1
     assert capsys.readouterr() == ("1 of 2 greeted\n", "error: the other one: has gone\n")

@@ -140,8 +140,12 @@ def _converted(type_: Any, tokens: Sequence[cyclopts.Token]) -> Any:
     hyphen = next((token for token in tokens if token.value == _HYPHEN and token.keyword is not None), None)
     if hyphen is not None:
         raise cyclopts.CoercionError(token=hyphen, msg="- is standard input, which only a source can be; give a name")
+    kinds = (type_, *get_args(type_))
+    empty = next((token for token in tokens if not token.value and (token.keyword is None or Path in kinds)), None)
+    if empty is not None:  # a path of it would be the current folder
+        raise cyclopts.CoercionError(token=empty, msg="an empty word names nothing; is a variable of the shell unset?")
     tokens = [token.evolve(value="-") if token.value == _HYPHEN else token for token in tokens]
-    if int in (type_, *get_args(type_)):
+    if int in kinds:
         fraction = next((token for token in tokens if "." in token.value), None)
         if fraction is not None:
             raise cyclopts.CoercionError(token=fraction, target_type=int)
