@@ -145,6 +145,24 @@ def test_a_part_is_that_of_the_whole_where_seeking_leads_astray(
         assert [(index_of(frame), frame.index, frame.timestamp) for frame in part] == whole[first:]
 
 
+def test_mpeg_ts_is_not_read_from_its_beginning_where_a_key_frame_is_near(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.ts"
+    path.write_bytes(encoded(0, 20, "mpegts", "libx264", key_every=12))
+    reader = VideoReader(path, Clip(start=1.5))
+    opened, again = [], reader._open
+
+    def noted() -> Any:
+        opened.append(path)
+        return again()
+
+    monkeypatch.setattr(reader, "_open", noted)
+    monkeypatch.setattr("trilitenet.inference.sources._KEY_FRAMES", 0.6)
+    assert [index_of(frame) for frame in reader] == list(range(15, 20))
+    assert len(opened) == 1
+
+
 def test_a_variable_frame_rate_is_kept(tmp_path: Path) -> None:
     times = [0, 0.1, 0.15, 0.5, 0.9, 2.0]
     frames = list(VideoReader(video(tmp_path / "a.mp4", frames=6, times=times)))

@@ -64,6 +64,8 @@ _SLACK: Final = 1e-6
 _WITH_LENGTH: Final = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "flv", "asf")
 """FFmpeg's names of the containers that state their length, which of others is found from what is there."""
 _INDEX_FIRST: Final = "its index comes first: ffmpeg -i IN -c copy -movflags +faststart OUT"
+_KEY_FRAMES: Final = 10.0
+"""Seconds in which a video is expected to have a key frame."""
 _NO_TIMESTAMPS: Final = 0x80
 """FFmpeg's flag of formats without time stamps, such as raw H.264, to whose frames it gives 25 a second."""
 _UNKNOWN: Final = 1 << 30
@@ -242,32 +244,40 @@ class VideoReader(FrameReader):
         return _open_container(self._path, self.name, timeout=self._timeout)
 
     def _decode(self) -> Any:
-        broken = self.broken
-        with self._open() as container:
-            first: int | None = None
-            if self.clip.start and self._path != "-":
-                stream = container.streams.video[0]
-                first = stream.start_time  # without one (H.264, JPEGs as such) nobody knows where a seek has led
-            astray = first is not None
-            if first is not None:
-                with contextlib.suppress(_av().FFmpegError):  # what cannot seek is read from its beginning
-                    container.seek(first + int(self.clip.start / stream.time_base), stream=stream)
-            frames = _frames_of(container, self)
-            for timestamp, make in itertools.islice(frames, 1):
-                if first is not None:  # the broken frames before it are counted besides
-                    self._skipped = round(timestamp * (self.rate or 0)) - (self.broken - broken)
-                    astray = timestamp > self.clip.start + _SLACK
-                if not astray:
-                    yield timestamp, make
-            if not astray:
-                yield from frames
-        if astray:  # as in recordings one after the other, whose time stamps begin anew, or behind the last key frame
-            self._skipped, self.broken = 0, broken
+        frames = None
+        if self.clip.start and self._path != "-":
+            with self._open() as container:
+                frames = self._sought(container)
+                if frames is not None:
+                    yield from frames
+        if frames is None:
             with self._open() as container:
                 yield from _frames_of(container, self)
         if self.broken:
             what = "frame was" if self.broken == 1 else "frames were"
             _LOGGER.warning("%s: %d broken %s left out", self.name, self.broken, what)
+
+    def _sought(self, container: Any) -> Iterator[_Decoded] | None:
+        """Return the frames from the last key frame before the start on; None where seeking does not lead there.
+
+        That is so in H.264 and JPEGs without a container, which have no time stamps to go by, and in recordings one
+        after the other, whose time stamps begin anew.
+        """
+        stream, broken = container.streams.video[0], self.broken
+        if stream.start_time is None:
+            return None
+        for back in (0.0, _KEY_FRAMES):  # MPEG-TS is entered at any frame, and decoded from the next key frame on
+            seconds = max(0.0, self.clip.start - back)
+            with contextlib.suppress(_av().FFmpegError):  # what cannot seek is read from its beginning
+                container.seek(stream.start_time + int(seconds / stream.time_base), stream=stream)
+            frames = _frames_of(container, self)
+            head = next(frames, None)
+            if head is not None and head[0] <= self.clip.start + _SLACK:
+                # The broken frames before it are counted besides.
+                self._skipped = round(head[0] * (self.rate or 0)) - (self.broken - broken)
+                return itertools.chain([head], frames)
+            self.broken = broken
+        return None
 
 
 class StreamReader(FrameReader):
