@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -135,7 +136,7 @@ def test_values(value: str | int, parsed: int | tuple[int, int, int]) -> None:
 def test_bad_mappings(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "mapping.yaml"
     path.write_text(text)
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(ConfigError, match=f"^{re.escape(str(path))}: .*{message}"):
         read_mapping(path)
 
 

@@ -49,6 +49,9 @@ class MaskRule:
     path: str
     values: dict[str | int, str] = dataclasses.field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self.meanings()
+
     def meanings(self) -> dict[int | tuple[int, int, int], str]:
         """Return the values parsed; none = everything above 0 is foreground, as for `MaskFile`.
 
@@ -204,10 +207,7 @@ def read_mapping(path: str | Path | None) -> LabelMapping:
     """
     if path is None:
         return LabelMapping()
-    mapping = parse(LabelMapping, read_yaml(path), str(path))
-    for rule in (mapping.drivable_mask, mapping.lane_mask):
-        rule.meanings()
-    return mapping
+    return parse(LabelMapping, read_yaml(path), str(path))
 
 
 def parse_colour(value: str | int) -> int | tuple[int, int, int]:
