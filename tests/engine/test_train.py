@@ -183,6 +183,7 @@ def test_the_card_claims_no_figure_that_is_undefined(tmp_path: Path) -> None:
     run = trainer(tmp_path, max_steps=1, validate=lambda _network, _show: {"lane/iou": math.nan, "drivable/miou": 0.5})
     result, _ = fit(run)
     assert math.isnan(result.metrics["lane/iou"])
+    assert result.summary().endswith(" (lane/iou -, drivable/miou 0.5000)")
     assert read_card(result.weights).metrics == {"val drivable/miou": 0.5}
     assert read_card(tmp_path / "best-drivable.safetensors").metrics["val drivable/miou"] == 0.5
 

@@ -47,7 +47,7 @@ from trilitenet.engine.loggers import build_loggers, check_loggers
 from trilitenet.engine.recipe import TrainConfig, merge, read_recipe
 from trilitenet.engine.results import write_results
 from trilitenet.engine.runtime import follow, running_fabric
-from trilitenet.engine.train import CHECKPOINT_NAME, Trainer, TrainResult, holds_run
+from trilitenet.engine.train import CHECKPOINT_NAME, Trainer, TrainResult, figures_in_words, holds_run
 from trilitenet.engine.transfer import freeze, initialise
 from trilitenet.errors import ConfigError, DataError, OutputError, TriLiteNetError, few, import_extra
 from trilitenet.inference.predictor import Predictor
@@ -168,7 +168,7 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
                 folder / "metrics.csv",
                 title=f"TriLiteNet {config.variant}: {folder_name(folder)}",
                 facts={**network.card.provenance, "training data": "; ".join(network.card.training_data)}
-                | {name: f"{value:.4f}" for name, value in result.metrics.items()},
+                | figures_in_words(result.metrics),
                 pictures=[] if validation is None else _pictures(predictor, validation, config.pictures),
             )
     return result

@@ -44,7 +44,7 @@ from trilitenet.losses.multitask import LossTerms, MultiTaskLoss
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
 from trilitenet.models.weights import read_card, save_network
 
-__all__ = ["CHECKPOINT_NAME", "FIGURES", "TrainResult", "Trainer", "holds_run"]
+__all__ = ["CHECKPOINT_NAME", "FIGURES", "TrainResult", "Trainer", "figures_in_words", "holds_run"]
 
 
 CHECKPOINT_NAME: Final = "last.ckpt"
@@ -132,7 +132,7 @@ class TrainResult:
         speed += f" at {self.images_per_second:.1f} images/s" if self.images_per_second else ", none of them new"
         if not self.finished:
             return f"stopped {speed}; {self.folder / CHECKPOINT_NAME} holds its state, go on with --resume"
-        figures = ", ".join(f"{name} {value:.4f}" for name, value in self.metrics.items())
+        figures = ", ".join(f"{name} {value}" for name, value in figures_in_words(self.metrics).items())
         return f"finished {speed}: {self.weights}" + (f" ({figures})" if figures else "")
 
 
@@ -476,7 +476,7 @@ class Trainer:
                 f"without it by --val-split ''; {self._keep()}"
             ) from error
         self._tell({f"val/{name}": value for name, value in self.metrics.items()})
-        figures = ", ".join(f"{name} {value:.4f}" for name, value in self.metrics.items())
+        figures = ", ".join(f"{name} {value}" for name, value in figures_in_words(self.metrics).items())
         self._show(f"epoch {epoch + 1}/{self.config.epochs}: {figures}")
         self._keep_best()
         return True
@@ -675,6 +675,11 @@ def _changes(before: Mapping[str, Any], after: Mapping[str, Any], within: str = 
             yield from _changes(old, value, f"{within}{name}.")
         elif old != value and name not in ("data", "output"):
             yield f"{within}{name} {value} (was {old})"
+
+
+def figures_in_words(figures: Mapping[str, float]) -> dict[str, str]:
+    """Return figures as they are shown; a dash is undefined, as of a task that nothing is labelled for."""
+    return {name: "-" if math.isnan(value) else f"{value:.4f}" for name, value in figures.items()}
 
 
 def holds_run(folder: Path) -> bool:
