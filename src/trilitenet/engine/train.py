@@ -547,8 +547,7 @@ class Trainer:
 
     def _card(self) -> ModelCard:
         provenance = {**self.card.provenance, "steps": str(self.step)}
-        # A figure that is undefined, as of a task without labels, was not measured; JSON has no word for it either.
-        metrics = {f"val {name}": value for name, value in self.metrics.items() if math.isfinite(value)}
+        metrics = {f"val {name}": value for name, value in self.metrics.items()}
         return dataclasses.replace(self.card, metrics=metrics, provenance=provenance)
 
     def save(self) -> None:
