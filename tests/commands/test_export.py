@@ -71,7 +71,7 @@ def test_options_that_do_not_fit(artefacts: Artefacts, tmp_path: Path) -> None:
         ({"format": "ncnn", "precision": "bf16"}, "ncnn artefacts come as fp32, fp16, not bf16"),
         ({"format": "ncnn", "size": "dynamic"}, "ncnn needs a fixed --size"),
         ({"format": "executorch", "size": "dynamic"}, "executorch needs a fixed --size"),
-        ({"format": "executorch", "precision": "fp16"}, "executorch artefacts come as fp32, not fp16"),
+        ({"format": "executorch", "precision": "fp16"}, "executorch artefacts come as fp32, int8, not fp16"),
         ({"format": "ncnn", "mask_scale": 2}, "--mask-scale doubles masks that are decided"),
         ({"format": "ncnn", "output": tmp_path / "a.param"}, "end with .ncnn.param"),
         ({"format": "tensorrt", "output": Path()}, "end with .engine"),
@@ -424,7 +424,7 @@ def test_int8(traced: str, tmp_path: Path, frames: Path, format_: str, monkeypat
             [0.5],
             0,
             (
-                "in floating point: attention and depthwise convolutions only",
+                "in floating point: nothing that can be quantised",
                 "largest drop on val: 0.50 points",
             ),
         ),
@@ -450,7 +450,9 @@ def test_int8_keeps_as_little_in_floating_point_as_the_scores_allow(
         def measure(self, backend: object) -> float:
             return next(left)
 
-    monkeypatch.setattr(command, "quantize_onnx", lambda built, inputs, keep: calls.append((inputs, tuple(keep))))
+    def quantize(inputs: Any, keep: Any) -> None:
+        calls.append((inputs, tuple(keep)))
+
     monkeypatch.setattr(command, "prepare_input", lambda image, told: (image.shape, told))
     monkeypatch.setattr(command, "_Drop", Drop)
     monkeypatch.setattr(command, "_write", lambda *_: None)
@@ -459,7 +461,7 @@ def test_int8_keeps_as_little_in_floating_point_as_the_scores_allow(
         command, "_keep", lambda _network, _built, info, path, _checks: command.Exported(path, info, None)
     )
     info = ArtefactInfo("onnx", "int8", (32, 64))
-    arguments: tuple[Any, ...] = (None, None, info, tmp_path / "a.onnx", [], tmp_path / "data", 500, max_drop)
+    arguments: tuple[Any, ...] = (None, quantize, info, tmp_path / "a.onnx", [], tmp_path / "data", 500, max_drop)
     if step is None:
         with pytest.raises(BackendError, match=r"INT8 costs too much .*\(9\.00 points lost, at most 1\.0 allowed\)"):
             command._export_int8(*arguments)

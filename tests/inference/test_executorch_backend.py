@@ -12,21 +12,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from filelock import FileLock
+from PIL import Image
 
 import trilitenet
 from tests.artefacts import SIZE, Artefacts, check_backend
 from tests.deploy.networks import lively_network
 from trilitenet.commands.export import export
 from trilitenet.config import ArtefactInfo
-from trilitenet.deploy.executorch import build_executorch
-from trilitenet.deploy.graph import DeployGraph
+from trilitenet.data.synthetic import SyntheticScenes
+from trilitenet.deploy.executorch import _folded, _quantised, build_executorch
+from trilitenet.deploy.graph import DeployGraph, Traceable
 from trilitenet.deploy.layouts import LAYOUTS
+from trilitenet.deploy.quiet import quiet
 from trilitenet.errors import BackendError, ConfigError, MissingExtraError, ShapeError, WeightsError
 from trilitenet.inference.executorch_backend import ExecuTorchBackend, _unsaid
+from trilitenet.models.trilitenet import build_network
 from trilitenet.models.weights import load_network, save_network
 
-pytest.importorskip("executorch")
+pytest.importorskip("executorch.exir")  # whose parts cannot be imported before it
 pytestmark = pytest.mark.slow  # whichever comes first waits for a program
 
 
@@ -45,13 +50,13 @@ def program(artefacts: Artefacts) -> Path:
 
 def test_equals_the_network(artefacts: Artefacts, program: Path) -> None:
     backend = ExecuTorchBackend(program)
-    assert backend.name == "executorch cpu"
+    assert backend.name == "executorch cpu fp32"
     check_backend(backend, artefacts)
 
 
 def test_load_finds_it_and_another_process_may_have_it(program: Path) -> None:
     predictor = trilitenet.load(program, threads=1)
-    assert predictor.backend.name == "executorch cpu"
+    assert predictor.backend.name == "executorch cpu fp32"
     copy = pickle.loads(pickle.dumps(predictor))  # noqa: S301 - its own
     frame = np.random.default_rng(1).integers(0, 256, (90, 160, 3), np.uint8)
     np.testing.assert_array_equal(copy(frame).lane, predictor(frame).lane)
@@ -150,3 +155,48 @@ def test_export_of_one_task(tmp_path: Path) -> None:
         perception = predictor(np.zeros((90, 160, 3), np.uint8))
         assert perception.lane is not None
         assert perception.drivable is None
+
+
+def test_int8_leaves_whole_parts_in_floating_point() -> None:
+    network = lively_network()
+    info = ArtefactInfo("executorch", "int8", SIZE, input="float_nchw", masks="logit", trilitenet="0")
+    traceable = Traceable(DeployGraph(network, LAYOUTS["planar"], masks="logit"), network.card, info)
+    image = np.random.default_rng(0).uniform(0, 255, (1, 3, *SIZE)).astype(np.float32)
+    with torch.no_grad(), quiet():
+        program = torch.export.export(traceable, (traceable.image,))
+        made = _quantised(program, [image], ("detection",))
+        lowered = _folded(torch.export.export(made, (traceable.image,)).run_decompositions({}))
+    weights = [node for node in lowered.graph.nodes if "dequantize_per_channel" in str(node.target)]
+    assert len(weights) > 20
+    found: dict[bool, set[str]] = {True: set(), False: set()}
+    for node in made.graph.nodes:
+        modules = ".".join(path for path, _ in node.meta.get("nn_module_stack", {}).values())
+        if any("quantize_per_tensor" in str(user.target) for user in node.users):
+            found["detection" in modules.split(".")].add(str(node.target))
+    assert {"aten.conv2d.default", "aten.cat.default"} <= found[False]
+    assert found[True] == set()  # its concatenations neither: boxes would take the scale of scores
+
+
+def test_int8_of_one_task(tmp_path: Path) -> None:
+    network = build_network("tiny", tasks=("lane",))
+    whole = load_network("tiny").state_dict()
+    network.load_state_dict({name: whole[name] for name in network.state_dict()})
+    save_network(network.eval(), tmp_path / "weights.safetensors", network.card)
+    scenes = SyntheticScenes(seed=0, size=(96, 160))
+    (tmp_path / "frames").mkdir()
+    for index in range(3):
+        Image.fromarray(scenes[index].image).save(tmp_path / "frames" / f"{index}.png")
+    path = tmp_path / "a.pte"
+    done = export(
+        tmp_path / "weights.safetensors",
+        format="executorch",
+        precision="int8",
+        calibration=tmp_path / "frames",
+        size="96x160",
+        output=path,
+    )
+    assert done.parity is not None
+    assert done.parity.failures == []
+    assert done.notes == ("in floating point: difference, detection, c5",)
+    with trilitenet.load(path) as predictor:
+        assert predictor.backend.name == "executorch cpu int8"

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import io
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
@@ -79,7 +80,7 @@ PRECISIONS: Final[dict[str, tuple[Precision, ...]]] = {
     "onnx": ("fp32", "fp16", "int8"),
     "openvino": ("fp32", "fp16", "bf16", "int8"),
     "ncnn": ("fp32", "fp16"),
-    "executorch": ("fp32",),
+    "executorch": ("fp32", "int8"),
     "tensorrt": ("fp32", "fp16", "bf16"),
     "torch": ("fp32",),
     "triton": ("fp32", "fp16", "int8"),
@@ -247,7 +248,10 @@ def export(
     if format == "ncnn":
         return _keep(network, build_ncnn(graph, network.card, info), info, path, checks)
     if format == "executorch":
-        return _keep(network, build_executorch(graph, network.card, info), info, path, checks)
+        build = functools.partial(build_executorch, graph, network.card, info)
+        if calibration is None or precision != "int8":
+            return _keep(network, build(), info, path, checks)
+        return _export_int8(network, build, info, path, checks, calibration, calibration_frames, max_drop)
     thresholds = network.card.thresholds if nms else None
     proto = build_onnx(graph, network.card, info, nms=thresholds, half=format == "onnx" and precision == "fp16")
     if format == "tensorrt":
@@ -255,7 +259,8 @@ def export(
     built: Any = build_openvino(proto) if format == "openvino" else proto
     if calibration is None or precision != "int8":
         return _keep(network, built, info, path, checks)
-    return _export_int8(network, built, info, path, checks, calibration, calibration_frames, max_drop)
+    quantize = functools.partial(quantize_openvino if format == "openvino" else quantize_onnx, built)
+    return _export_int8(network, quantize, info, path, checks, calibration, calibration_frames, max_drop)
 
 
 def _check_options(
@@ -534,7 +539,7 @@ class _Drop:
 
 def _export_int8(
     network: TriLiteNet,
-    built: Any,
+    quantize: Callable[[Sequence[NDArray[Any]], Sequence[str]], Any],
     info: ArtefactInfo,
     path: Path,
     checks: Sequence[NDArray[np.uint8]],
@@ -546,10 +551,9 @@ def _export_int8(
     canvas = info.size or network.card.input_size
     inputs = [prepare_input(image, info) for image in _canvases(calibration, canvas, calibration_frames, split="train")]
     budget = None if max_drop is None else _Drop(network, info.size, calibration)
-    quantize = quantize_openvino if info.format == "openvino" else quantize_onnx
     reason = ""
     for keep in KEEP_STEPS if budget else KEEP_STEPS[1:2]:
-        candidate = quantize(built, inputs, keep)
+        candidate = quantize(inputs, keep)
         drop = 0.0
         if budget:
             with scratch_folder() as folder:
@@ -558,7 +562,7 @@ def _export_int8(
                 drop = budget.measure(_open(trial, info))
         if max_drop is None or drop <= max_drop:
             exported = _keep(network, candidate, info, path, checks)
-            kept = f"in floating point: {', '.join(keep) or 'attention and depthwise convolutions only'}"
+            kept = f"in floating point: {', '.join(keep) or 'nothing that can be quantised'}"
             notes = (kept,) if max_drop is None else (kept, f"largest drop on val: {drop:.2f} points")
             return dataclasses.replace(exported, notes=notes)
         reason = f"{drop:.2f} points lost, at most {max_drop} allowed"

@@ -7,25 +7,36 @@ from __future__ import annotations
 
 import contextlib
 import gc
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
+from numpy.typing import NDArray
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
 from trilitenet.deploy.graph import DeployGraph, Traceable
+from trilitenet.deploy.quantize import kept_nodes
 from trilitenet.deploy.quiet import quiet
 from trilitenet.errors import BackendError, import_extra
 
 __all__ = ["build_executorch"]
 
 
-def build_executorch(graph: DeployGraph, card: ModelCard, info: ArtefactInfo) -> bytes:
+def build_executorch(
+    graph: DeployGraph,
+    card: ModelCard,
+    info: ArtefactInfo,
+    images: Sequence[NDArray[Any]] = (),
+    keep: Sequence[str] = (),
+) -> bytes:
     """Lower the deploy graph; what XNNPACK does not know stays on ExecuTorch's own kernels.
 
     Args:
         graph: The deploy graph, planar and with mask logits.
         card: What the network is.
         info: How the artefact takes pixels and returns results: of a fixed size.
+        images: Inputs of the artefact, each with a leading 1, to calibrate INT8 with; without them it is not quantised.
+        keep: Parts that INT8 leaves in floating point, see `trilitenet.deploy.quantize.KEEP_STEPS`.
 
     Returns:
         Content of the ``.pte``.
@@ -36,14 +47,16 @@ def build_executorch(graph: DeployGraph, card: ModelCard, info: ArtefactInfo) ->
     """
     with quiet(), _uncollected():
         exir = import_extra("executorch.exir", "executorch")
-        folding = import_extra("executorch.exir.passes.constant_prop_pass", "executorch")
         xnnpack = import_extra("executorch.backends.xnnpack.partition.xnnpack_partitioner", "executorch")
         traceable = Traceable(graph, card, info)
         try:
             with torch.no_grad():
-                program = torch.export.export(traceable, (traceable.image,)).run_decompositions({})
+                program = torch.export.export(traceable, (traceable.image,))
+                if images:
+                    program = torch.export.export(_quantised(program, images, keep), (traceable.image,))
+                program = program.run_decompositions({})
             lowered = exir.to_edge_transform_and_lower(
-                folding.constant_prop_pass(program),  # the grids and anchors of the decoding
+                _folded(program),
                 partitioner=[xnnpack.XnnpackPartitioner()],
                 constant_methods={CARD_KEY: card.to_json(), ARTEFACT_KEY: info.to_json()},
             )
@@ -52,6 +65,34 @@ def build_executorch(graph: DeployGraph, card: ModelCard, info: ArtefactInfo) ->
             raise BackendError(
                 f"ExecuTorch cannot lower the deploy graph ({' '.join(str(error).split())[:160]})"
             ) from error
+
+
+def _folded(program: Any) -> Any:
+    """Return an exported program with the grids and anchors of the decoding computed; weights of INT8 stay so."""
+    folding = import_extra("executorch.exir.passes.constant_prop_pass", "executorch")
+    return folding.constant_prop_pass(program, custom_skip_targets=set(folding._QUANT_PRIMITIVES))
+
+
+def _quantised(program: Any, images: Sequence[NDArray[Any]], keep: Sequence[str]) -> Any:
+    """Return the module of an exported program with static INT8: weights symmetric a channel, activations a tensor."""
+    xnnpack = import_extra("executorch.backends.xnnpack.quantizer.xnnpack_quantizer", "executorch")
+    pt2e = import_extra("torchao.quantization.pt2e.quantize_pt2e", "executorch")
+
+    class Quantizer(xnnpack.XNNPACKQuantizer):  # type: ignore[misc, name-defined]
+        def annotate(self, model: torch.fx.GraphModule) -> torch.fx.GraphModule:
+            """Mark what is quantised. Its own filter forgets concatenations: boxes and scores would share a scale."""
+            model = super().annotate(model)
+            for node in model.graph.nodes:
+                modules = (path for path, _ in node.meta.get("nn_module_stack", {}).values())
+                if kept_nodes(["/".join(modules).replace(".", "/")], keep):
+                    node.meta.pop("quantization_annotation", None)
+            return model
+
+    quantizer = Quantizer().set_global(xnnpack.get_symmetric_quantization_config(is_per_channel=True))
+    module = pt2e.prepare_pt2e(program.module(), quantizer)
+    for image in images:
+        module(torch.from_numpy(image))
+    return pt2e.convert_pt2e(module)
 
 
 @contextlib.contextmanager

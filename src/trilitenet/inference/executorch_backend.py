@@ -74,8 +74,8 @@ class ExecuTorchBackend(ArtefactBackend):
 
     @property
     def name(self) -> str:
-        """The runtime and the device."""
-        return "executorch cpu"
+        """The runtime, the device and the precision."""
+        return f"executorch cpu {self.info.precision}"
 
     def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
         session = held(self._session, self._path)
