@@ -259,6 +259,7 @@ def test_other_layouts_are_named(tmp_path: Path) -> None:
 def test_images_without_folders_of_splits_are_not_found_clean(root: Path) -> None:
     for folder in root.glob("*/train"):
         shutil.copytree(folder, root / "flat" / folder.parent.name)
+    (root / "flat/images/.ipynb_checkpoints").mkdir()  # by looking at the folder
     with pytest.raises(DataError, match="looks like images that are in no folder of a split, not the published layout"):
         check_dataset(root / "flat")
 

@@ -189,7 +189,7 @@ def detect_layout(root: str | Path) -> tuple[str, str]:
         return "prepared", "a prepared data set (prepared.json)"
     annotated = [folder for folder, _ in LABEL_FILES.values() if (root / folder).is_dir()]
     if (root / IMAGE_FOLDER).is_dir() and annotated:
-        if not any(path.is_dir() for path in (root / IMAGE_FOLDER).iterdir()):
+        if not split_folders(root):
             return "unknown", "images that are in no folder of a split"
         return "published", f"the published layout ({', '.join([IMAGE_FOLDER, *annotated])})"
     if (
