@@ -722,11 +722,12 @@ def test_frames_without_time_stamps_come_at_the_rate_of_the_stream(tmp_path: Pat
         assert [frame.timestamp for frame in frames] == pytest.approx([i / 10 for i in indices])
 
 
+@pytest.mark.parametrize(("codec", "b_frames"), [("libx264", 3), ("mpeg4", 2)])
 def test_frames_that_avi_stores_in_another_order_than_they_are_shown_in_have_their_times(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    codec: str, b_frames: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "a.avi"
-    path.write_bytes(encoded(0, 20, "avi", "libx264", key_every=5, b_frames=3))
+    path.write_bytes(encoded(0, 20, "avi", codec, key_every=5, b_frames=b_frames))
     for clip, indices in ((Clip(), range(20)), (Clip(start=1.2), range(12, 20))):
         frames = list(VideoReader(path, clip))
         assert [index_of(frame) for frame in frames] == [frame.index for frame in frames] == list(indices)

@@ -260,11 +260,11 @@ class VideoReader(FrameReader):
     def _sought(self, container: Any) -> Iterator[_Decoded] | None:
         """Return the frames from the last key frame before the start on; None where seeking does not lead there.
 
-        That is so in H.264 and JPEGs without a container, which have no time stamps to go by, and in recordings one
-        after the other, whose time stamps begin anew.
+        That is so in H.264 and JPEGs without a container, which have no time stamps to go by, in recordings one after
+        the other, whose time stamps begin anew, and in AVI whose frames are counted from the first that is stored.
         """
         stream, broken = container.streams.video[0], self.broken
-        if stream.start_time is None:
+        if stream.start_time is None or _is_reordered(container):
             return None
         for back in (0.0, _KEY_FRAMES):  # MPEG-TS is entered at any frame, and decoded from the next key frame on
             seconds = max(0.0, self.clip.start - back)
@@ -653,8 +653,7 @@ def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
     last = -step
     end = 0.0
     places: list[int] = []
-    # AVI counts frames as they are stored, which is not how they are shown.
-    reordered = container.format.name == "avi" and stream.codec_context.has_b_frames
+    reordered = _is_reordered(container)
     # Without a length of its own, the video is measured by that of the container, which may be that of its sound.
     packets = container.demux(stream) if reader.live or stream.duration else container.demux()
     while True:
@@ -714,6 +713,11 @@ def _frames_of(container: Any, reader: FrameReader) -> Iterator[_Decoded]:
 def _step(container: Any, reader: FrameReader) -> float:
     """Return about how many seconds lie between two frames."""
     return 1 / (reader.rate or _rate_of(container) or 30.0)
+
+
+def _is_reordered(container: Any) -> bool:
+    """Return whether frames are counted as they are stored, in AVI, which is not how they are shown."""
+    return bool(container.format.name == "avi" and container.streams.video[0].codec_context.has_b_frames)
 
 
 def _upright(frame: Any) -> NDArray[np.uint8]:
