@@ -74,6 +74,8 @@ def test_a_lone_hyphen_is_a_word_but_no_value_of_an_option(
         "error: Invalid value for --name: - is standard input, which only a source can be; give a name "
         "(see: trilitenet greet --help)\n"
     )
+    assert cli.main(["greet", "Ada", "-"]) == 2
+    assert capsys.readouterr().err == "error: unexpected - (see: trilitenet greet --help)\n"
 
 
 @pytest.mark.parametrize(

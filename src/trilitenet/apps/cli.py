@@ -309,7 +309,7 @@ def _one_line(error: CycloptsError) -> str:
     else:
         text = " ".join(str(error).split()).replace("positional arguments. Only got", "values, got")
     chain = " ".join(["trilitenet", *(error.command_chain or ())])
-    return f"{text.rstrip('.')} (see: {chain} --help)"
+    return f"{text.rstrip('.')} (see: {chain} --help)".replace(_HYPHEN, "-")
 
 
 def _open_closed_streams() -> None:
