@@ -614,7 +614,8 @@ class Trainer:
         self._saved = self.step
         self._best_of = state.get("best_of")
         before, now = self._best_of, self.measured_on
-        changed = tell_apart(before, now) if before and now else None
+        goes_on = self.step < self.steps or self.ended < self.step
+        changed = tell_apart(before, now) if before and now and goes_on else None
         if changed:
             self._show(f"was validated on {changed}: what is best is found anew")
             self.best, self.stale = {}, 0
