@@ -266,6 +266,9 @@ class VideoReader(FrameReader):
         stream, broken = container.streams.video[0], self.broken
         if stream.start_time is None or _is_reordered(container):
             return None
+        length = container.duration if container.format.name not in _WITH_LENGTH else None
+        if length is not None and self.clip.start > length / 1e6:
+            return None  # the length is that of the last recording, by whose time stamps it would be sought
         for back in (0.0, _KEY_FRAMES):  # MPEG-TS is entered at any frame, and decoded from the next key frame on
             seconds = max(0.0, self.clip.start - back)
             with contextlib.suppress(_av().FFmpegError):  # what cannot seek is read from its beginning
