@@ -142,21 +142,6 @@ def test_the_extra_is_named(program: Path, monkeypatch: pytest.MonkeyPatch) -> N
         ExecuTorchBackend(program)
 
 
-def test_export_of_one_task(tmp_path: Path) -> None:
-    network = lively_network(tasks=("lane",))
-    save_network(network, tmp_path / "weights.safetensors", network.card)
-    path = tmp_path / "made" / "a.pte"
-    done = export(tmp_path / "weights.safetensors", format="executorch", bgr=True, size="64x96", output=path)
-    assert done.parity is not None
-    assert done.parity.failures == []
-    assert [file.name for file in path.parent.iterdir()] == ["a.pte"]
-    with trilitenet.load(path) as predictor:
-        assert predictor.backend.card.tasks == ("lane",)
-        perception = predictor(np.zeros((90, 160, 3), np.uint8))
-        assert perception.lane is not None
-        assert perception.drivable is None
-
-
 def test_int8_leaves_whole_parts_in_floating_point() -> None:
     network = lively_network()
     info = ArtefactInfo("executorch", "int8", SIZE, input="float_nchw", masks="logit", trilitenet="0")
@@ -177,26 +162,32 @@ def test_int8_leaves_whole_parts_in_floating_point() -> None:
     assert found[True] == set()  # its concatenations neither: boxes would take the scale of scores
 
 
-def test_int8_of_one_task(tmp_path: Path) -> None:
+def test_export_of_one_task_in_int8(tmp_path: Path) -> None:
     network = build_network("tiny", tasks=("lane",))
     whole = load_network("tiny").state_dict()
     network.load_state_dict({name: whole[name] for name in network.state_dict()})
     save_network(network.eval(), tmp_path / "weights.safetensors", network.card)
     scenes = SyntheticScenes(seed=0, size=(96, 160))
     (tmp_path / "frames").mkdir()
-    for index in range(3):
+    for index in range(2):
         Image.fromarray(scenes[index].image).save(tmp_path / "frames" / f"{index}.png")
-    path = tmp_path / "a.pte"
+    path = tmp_path / "made" / "a.pte"
     done = export(
         tmp_path / "weights.safetensors",
         format="executorch",
         precision="int8",
         calibration=tmp_path / "frames",
+        bgr=True,
         size="96x160",
         output=path,
     )
     assert done.parity is not None
     assert done.parity.failures == []
     assert done.notes == ("in floating point: difference, detection, c5",)
+    assert [file.name for file in path.parent.iterdir()] == ["a.pte"]
     with trilitenet.load(path) as predictor:
         assert predictor.backend.name == "executorch cpu int8"
+        assert predictor.backend.card.tasks == ("lane",)
+        perception = predictor(np.zeros((90, 160, 3), np.uint8))
+        assert perception.lane is not None
+        assert perception.drivable is None

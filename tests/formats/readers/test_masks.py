@@ -129,7 +129,7 @@ def test_values(value: str | int, parsed: int | tuple[int, int, int]) -> None:
         ("drivable_mask: {path: x, values: {1: direct, '1,2,3': direct}}", "all levels or all colours"),
         ("classes: {light: [red, off]}", "got False; put it into quotes"),
         ("drivabel: [road]", "did you mean 'drivable'"),
-        ("classes: {a: [x], b: [x]}", r"mapping\.yaml: category 'x' belongs to both 'a' and 'b'"),
+        ("classes: {a: [x], b: [x]}", r"category 'x' belongs to both 'a' and 'b'"),
         ("[1, 2", "not YAML"),
         ("- 1", "must hold 'key: value' lines"),
     ],
