@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from trilitenet.commands.energy import gpu_meter
 from trilitenet.deploy.graph import DeployGraph
 from trilitenet.deploy.layouts import LAYOUTS
 from trilitenet.models.trilitenet import TriLiteNet, build_network, normalise_images
@@ -66,16 +67,6 @@ def deploy_graphed(network: TriLiteNet, batch: int, layout: str) -> Callable[[],
     return captured.replay
 
 
-def energy() -> Callable[[], float] | None:
-    try:
-        import pynvml
-    except ImportError:
-        return None
-    pynvml.nvmlInit()
-    device = pynvml.nvmlDeviceGetHandleByIndex(0)
-    return lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(device) / 1e3
-
-
 def timed(call: Callable[[], object], calls: int) -> float:
     torch.cuda.synchronize()
     started = time.perf_counter()
@@ -96,7 +87,7 @@ def main() -> int:
     if not torch.cuda.is_available():
         print("error: no CUDA device here", file=sys.stderr)
         return 1
-    joules = energy()
+    joules = gpu_meter(0)
     print(f"{torch.cuda.get_device_name()}, PyTorch {torch.__version__}, {SIZE[1]}x{SIZE[0]}", flush=True)
     print("| variant | batch | way | frames/s | ratio | J/frame | W |\n|---|---|---|---|---|---|---|")
     for variant in arguments.variant:

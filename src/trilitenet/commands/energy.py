@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import shutil
@@ -13,7 +14,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final, TypeAlias
 
-__all__ = ["Meter", "energy_meters"]
+__all__ = ["Meter", "energy_meters", "gpu_meter"]
 
 Meter: TypeAlias = Callable[[], float | None]
 """Returns the joules since some time, or None where they cannot be read."""
@@ -40,17 +41,13 @@ def energy_meters(backends: Sequence[str]) -> Iterator[list[Meter]]:
         A meter for each.
     """
     with ExitStack() as stack:
-        board: list[Meter] = []
-        meters: list[Meter] = []
-        for backend in backends:
-            on_gpu = re.search(r"cuda:?(\d*)", backend)
-            meter = _package() if on_gpu is None else _gpu(int(on_gpu[1] or 0))
-            if meter is None:
-                if not board:
-                    board.append(_board(stack))
-                meter = board[0]
-            meters.append(meter)
-        yield meters
+        board = functools.cache(functools.partial(_board, stack))  # one, and only where it is needed
+        yield [_own_meter(backend) or board() for backend in backends]
+
+
+def _own_meter(backend: str) -> Meter | None:
+    on_gpu = re.search(r"cuda:?(\d*)", backend)
+    return _package() if on_gpu is None else gpu_meter(int(on_gpu[1] or 0))
 
 
 def _package() -> Meter | None:
@@ -60,7 +57,8 @@ def _package() -> Meter | None:
     return None
 
 
-def _gpu(index: int) -> Meter | None:
+def gpu_meter(index: int) -> Callable[[], float] | None:
+    """Return what reads the joules of a GPU since its driver was loaded, by NVML; None where they cannot be read."""
     try:
         import pynvml
 
