@@ -207,6 +207,9 @@ def test_a_port_that_is_taken_is_named(script: Path, monkeypatch: pytest.MonkeyP
         with pytest.raises(ConfigError, match=f"port {port}, .* is taken; set MASTER_PORT"), pair(script, MEET):
             pass
     assert os.environ["MASTER_PORT"] == str(port)
+    monkeypatch.delenv("MASTER_PORT")
+    with pair(script, MEET) as fabric:  # the next one is as if the first had not been
+        fabric.barrier()
 
 
 def test_processes_that_could_not_meet_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -119,6 +119,8 @@ def running_fabric(
         others.end()
         if own and torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()  # so that another run may follow
+        elif own:
+            torch.distributed.distributed_c10d._world.group_count = 0  # likewise: a group that failed is counted
         torch.set_num_threads(threads)
         if first:
             for name, value in environment.items():
@@ -163,12 +165,14 @@ def _connect(fabric: Any, devices: int, num_nodes: int) -> None:
         raise ConfigError(" ".join(str(error).split())) from error
     try:
         fabric.launch()
-    except torch.distributed.DistError as error:
+    except RuntimeError as error:
         port = os.environ["MASTER_PORT"]
-        if "EADDRINUSE" in str(error):
+        if "EADDRINUSE" in str(error):  # of PyTorch 2.6 no DistError
             raise ConfigError(
                 f"port {port}, at which the processes are to meet, is taken; set MASTER_PORT to a free one, or unset it"
             ) from error
+        if not isinstance(error, torch.distributed.DistError):
+            raise
         raise TrainingError(
             f"the processes cannot meet at {os.environ['MASTER_ADDR']}:{port} ({str(error).splitlines()[0]}); "
             "see that the first one runs, and that MASTER_ADDR and MASTER_PORT name its machine and a free port"
