@@ -33,12 +33,19 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             raise NVMLError("Not Supported")
         return 5000 + gpu
 
+    def by_name(uuid: str) -> int:
+        if uuid not in ("GPU-a", "GPU-b"):
+            raise NVMLError("Not Found")
+        return int(uuid == "GPU-b")
+
     nvml = SimpleNamespace(
         nvmlInit=lambda: None,
         nvmlDeviceGetHandleByIndex=lambda index: index,
+        nvmlDeviceGetHandleByUUID=by_name,
         nvmlDeviceGetTotalEnergyConsumption=joules,
     )
     monkeypatch.setitem(sys.modules, "pynvml", nvml)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     monkeypatch.setattr(energy, "Path", lambda name: tmp_path)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     return tmp_path
@@ -52,6 +59,17 @@ def test_energy_is_that_of_what_the_model_runs_on(machine: Path, monkeypatch: py
     assert readings(*backends) == [5.0, 5.001, None, 7.5]
     monkeypatch.setattr("trilitenet.commands.energy.os.access", lambda *_: False)  # as most systems keep it
     assert readings("torch cpu") == [None]
+
+
+@pytest.mark.parametrize(
+    ("shown", "joules"),
+    [("1,0", [5.001, 5.0]), ("GPU-b, GPU-a", [5.001, 5.0]), ("1", [5.001, None]), ("", [None, None])],
+)
+def test_gpus_are_counted_as_cuda_does(
+    machine: Path, monkeypatch: pytest.MonkeyPatch, shown: str, joules: list[float | None]
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", shown)
+    assert readings("torch cuda", "torch cuda:1") == joules
 
 
 def tegrastats(folder: Path, *commands: str) -> None:

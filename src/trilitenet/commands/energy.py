@@ -58,14 +58,21 @@ def _package() -> Meter | None:
 
 
 def gpu_meter(index: int) -> Callable[[], float] | None:
-    """Return what reads the joules of a GPU since its driver was loaded, by NVML; None where they cannot be read."""
+    """Return what reads the joules of a GPU since its driver was loaded, by NVML; None where they cannot be read.
+
+    Args:
+        index: As CUDA counts those that ``CUDA_VISIBLE_DEVICES`` leaves to it, in the order of the PCI bus.
+    """
+    shown = os.environ.get("CUDA_VISIBLE_DEVICES")
     try:
         import pynvml
 
         pynvml.nvmlInit()
-        gpu = pynvml.nvmlDeviceGetHandleByIndex(index)
+        name = str(index) if shown is None else shown.split(",")[index].strip()
+        by_number, by_name = pynvml.nvmlDeviceGetHandleByIndex, pynvml.nvmlDeviceGetHandleByUUID
+        gpu = by_number(int(name)) if name.isdigit() else by_name(name)
         pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu)  # older GPUs and Jetsons refuse
-    except (ImportError, OSError, RuntimeError):
+    except (ImportError, OSError, RuntimeError, IndexError):
         return None
     except Exception as error:  # NVML's own errors derive from Exception alone
         if type(error).__module__ != "pynvml":
