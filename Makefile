@@ -28,7 +28,7 @@ DEVELOP := $(VENV)/.installed-develop
 DOCUMENT := $(VENV)/.installed-docs
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test browser check format docs clean distclean
+.PHONY: help demo test lowest browser check format docs clean distclean
 
 help: ## list the targets
 	@awk -F':.*## ' '/^[a-z]+:.*## /{printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -43,6 +43,12 @@ demo: $(RUNTIME) ## draw the three tasks on synthetic scenes, into demo-output/
 
 test: $(DEVELOP) ## run the test suite
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) $(PYTEST_ARGS)
+
+lowest: ## run the test suite with the oldest versions that pyproject.toml allows, in .venv-lowest
+	$(PYTHON) -m venv .venv-lowest
+	.venv-lowest/bin/python -m pip --disable-pip-version-check install --quiet uv
+	.venv-lowest/bin/uv pip install --quiet --python .venv-lowest/bin/python --resolution lowest-direct --editable ".[all,dev]"
+	OMP_NUM_THREADS=1 .venv-lowest/bin/python -m pytest -n $(JOBS) $(PYTEST_ARGS)
 
 browser: ## install Chromium for the tests of the page (Debian, Ubuntu; as root); without it they are skipped
 	apt-get update -qq
@@ -66,7 +72,7 @@ clean: ## remove what demo, tests and builds left
 	find src tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
 
 distclean: clean ## clean, and remove the virtual environment
-	rm -rf $(VENV)
+	rm -rf $(VENV) .venv-lowest
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null || { \

@@ -363,12 +363,12 @@ def _int8_weights(path: Path) -> list[int]:
 
 
 def _check_quantisers(path: Path) -> None:
-    """Activations are symmetric around 128, weights have a scale a channel, depthwise convolutions are left alone."""
+    """Activations are symmetric, weights have a scale a channel, depthwise convolutions are left alone."""
     onnx = pytest.importorskip("onnx")
     graph = onnx.load(path).graph
     values = {entry.name: onnx.numpy_helper.to_array(entry) for entry in graph.initializer}
     zeros = {int(values[node.input[2]]) for node in graph.node if node.op_type == "QuantizeLinear"}
-    assert zeros == {128}
+    assert zeros in ({128}, {127})  # the latter in ONNX Runtime 1.23
     from_integers = {node.output[0]: node for node in graph.node if node.op_type == "DequantizeLinear"}
     for node in graph.node:
         grouped = [attribute.i for attribute in node.attribute if attribute.name == "group" and attribute.i > 1]

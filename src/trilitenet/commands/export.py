@@ -417,7 +417,7 @@ def _write(built: Any, path: Path, network: TriLiteNet, info: ArtefactInfo) -> N
         metadata = {CARD_KEY: network.card.to_json(), ARTEFACT_KEY: info.to_json()}
         data = io.BytesIO()  # PyTorch aborts the process where it cannot write to a file
         torch.export.save(built, data, extra_files=metadata)
-        path.write_bytes(data.getbuffer())
+        path.write_bytes(data.getvalue())
     elif info.format == "tensorrt":  # pragma: no cover - needs a GPU and TensorRT
         from trilitenet.inference.tensorrt_backend import pack_engine
 

@@ -57,7 +57,7 @@ def build_ncnn(graph: DeployGraph, card: ModelCard, info: ArtefactInfo) -> NcnnM
         traced = io.BytesIO()  # PyTorch aborts the process where it cannot write to a file
         with quiet(), torch.no_grad():  # a trace is what pnnx reads; PyTorch would rather it read something newer
             torch.jit.save(torch.jit.trace(traceable, (traceable.image,), check_trace=False), traced)
-        (folder / "graph.pt").write_bytes(traced.getbuffer())
+        (folder / "graph.pt").write_bytes(traced.getvalue())
         command = [
             pnnx.EXEC_PATH,
             "graph.pt",

@@ -63,6 +63,7 @@ def build_onnx(
                 input_names=["image"],
                 output_names=list(card.tasks),
                 dynamic_shapes=traceable.dynamic,
+                optimize=True,  # PyTorch 2.6 would not
                 verbose=False,
             )
             assert program is not None

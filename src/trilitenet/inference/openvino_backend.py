@@ -76,12 +76,12 @@ class OpenVINOBackend(ArtefactBackend):
         try:
             model = core.read_model(path)
         except RuntimeError as error:
-            reason = " ".join(str(error).split())[:160]
-            if "ParseFromIstream" in str(error):
+            reason = " ".join(str(error).split())
+            if "ParseFromIstream" in reason or "binary protobuf" in reason:  # older versions say the latter
                 reason = "cut off or damaged; export it again"
-            elif "is_valid_weights_range" in str(error):
+            elif "is_valid_weights_range" in reason or "Incorrect weights" in reason:
                 reason = f"{weights.name} is cut off, or of another file; export it again"
-            raise WeightsError(f"{path}: not a usable OpenVINO or ONNX model ({reason})") from error
+            raise WeightsError(f"{path}: not a usable OpenVINO or ONNX model ({reason[:160]})") from error
         self._card, self.info = read_metadata(_metadata(model), str(path))
         shapes = [
             [] if each.rank.is_dynamic else [None if side.is_dynamic else side.get_length() for side in each]

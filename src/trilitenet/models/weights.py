@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from trilitenet.config import (
@@ -318,12 +318,14 @@ def _load_strictly(network: TriLiteNet, tensors: Mapping[str, Tensor], source: s
 
 
 def _load_pickle(path: Path) -> Any:
-    """Load what a pickle holds, of tensors and plain values; code in it is refused."""
+    """Load what a pickle or safetensors file holds, of tensors and plain values; code is refused."""
     if not path.is_file():
         raise WeightsError(f"{path}: {'is a folder' if path.is_dir() else 'does not exist'}")
     if path.stat().st_size == 0:
         raise WeightsError(f"{path}: is empty; download it again")
     try:
+        if path.name.lower().endswith(".safetensors"):  # PyTorch 2.6 would take it for a pickle
+            return load_file(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # on pickle protocols: what cannot be read raises below
             return torch.load(path, map_location="cpu", weights_only=True)
@@ -337,7 +339,7 @@ def _load_pickle(path: Path) -> Any:
         raise WeightsError(f"{path}: is not a PyTorch checkpoint, or is truncated") from error
     except (RuntimeError, EOFError, OSError, ValueError, KeyError, IndexError, AttributeError, TypeError) as error:
         raise WeightsError(f"{path}: is not a PyTorch checkpoint, or is truncated") from error
-    except SafetensorError as error:  # PyTorch goes by the ending
+    except SafetensorError as error:
         raise WeightsError(
             f"{path}: ends in .safetensors, but is not such a file, or is truncated ({error}); copy it again"
         ) from error
