@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import errno
 import math
@@ -20,6 +21,7 @@ from tests.artefacts import Artefacts
 from tests.fakes import ColourBackend
 from trilitenet.commands import export as command
 from trilitenet.commands.export import export, find_pictures
+from trilitenet.commands.progress import ProgressBar
 from trilitenet.config import TASKS, ArtefactInfo, Thresholds
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.synthetic_files import write_dataset
@@ -246,6 +248,19 @@ def test_an_interruption_leaves_no_half_of_an_artefact(tmp_path: Path, monkeypat
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == dict.fromkeys(names, "new")
 
 
+class Bar(ProgressBar):
+    """A bar that keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[str | tuple[int, int]] = []
+
+    def __call__(self, done: int, total: int) -> None:
+        self.told.append((done, total))
+
+    def name(self, what: str) -> None:
+        self.told.append(what)
+
+
 def _no_work(*_: object) -> Any:
     raise AssertionError("the work began")
 
@@ -386,6 +401,8 @@ def test_int8(traced: str, tmp_path: Path, frames: Path, format_: str, monkeypat
     else:
         monkeypatch.setattr(command, "build_onnx", build_onnx)  # in the layout of this runtime
     monkeypatch.setitem(TOLERANCES, "int8", Tolerance(pixels=0.5, boxes=0.0, confidence=1.0))
+    bar = Bar()
+    monkeypatch.setattr(command, "show_progress", lambda _: contextlib.nullcontext(bar))
     path = tmp_path / ("a.xml" if format_ == "openvino" else "a.onnx")
     done = export(
         traced,
@@ -396,6 +413,9 @@ def test_int8(traced: str, tmp_path: Path, frames: Path, format_: str, monkeypat
         output=path,
     )
     assert done.parity is not None
+    count = len(list(frames.iterdir()))
+    assert bar.told[: count + 1] == [*((done, count) for done in range(1, count + 1)), "frames calibrated with"]
+    assert (count, count) in bar.told[count + 1 :]
     text = path.read_bytes()
     assert (b"FakeQuantize" if format_ == "openvino" else b"QuantizeLinear") in text
     assert max(_int8_weights(path)) <= 64  # more would overflow where the processor lacks VNNI
@@ -451,7 +471,7 @@ def test_int8_keeps_as_little_in_floating_point_as_the_scores_allow(
             return next(left)
 
     def quantize(inputs: Any, keep: Any) -> None:
-        calls.append((inputs, tuple(keep)))
+        calls.append((list(inputs), tuple(keep)))
 
     monkeypatch.setattr(command, "prepare_input", lambda image, told: (image.shape, told))
     monkeypatch.setattr(command, "_Drop", Drop)
@@ -508,12 +528,15 @@ def test_the_drop_is_that_of_the_worst_of_all_tasks(
 
     monkeypatch.setattr(command, "evaluate", worse)
     path = export(traced, output=tmp_path / "a.onnx", size="64x128").path
-    drop = command._Drop(network, (64, 128), tmp_path / "data")
+    bar = Bar()
+    drop = command._Drop(network, (64, 128), tmp_path / "data", bar)
+    assert bar.told == ["images measured", (1, 2), (2, 2)]
     losses = [drop.measure(OnnxBackend(path)) for _ in range(4)]
+    assert bar.told == ["images measured", (1, 2), (2, 2)] * 5
     assert losses == pytest.approx([2.0, 3.0, 4.0, 50.0])  # what cannot be told is lost
     assert canvases == [(64, 128)] * 5  # the network is looked at once
     monkeypatch.undo()
     for labels in ("det_annotations", "da_seg_annotations", "ll_seg_annotations"):
         shutil.rmtree(tmp_path / "data" / labels)
     with pytest.raises(ConfigError, match="--max-drop needs labels"):
-        command._Drop(network, (64, 128), tmp_path / "data")
+        command._Drop(network, (64, 128), tmp_path / "data", bar)

@@ -21,6 +21,7 @@ from torch.nn.functional import interpolate
 import trilitenet
 from trilitenet.commands.load import open_backend
 from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, optional_path
+from trilitenet.commands.progress import ProgressBar, show_progress
 from trilitenet.config import (
     ARTEFACT_KEY,
     ARTEFACT_SUFFIXES,
@@ -362,7 +363,7 @@ def _parse_size(size: str) -> tuple[int, int] | None:
     return canvas
 
 
-def _canvases(source: Path | None, canvas: tuple[int, int], count: int, split: str = "val") -> list[NDArray[np.uint8]]:
+def _canvases(source: Path | None, canvas: tuple[int, int], count: int) -> list[NDArray[np.uint8]]:
     """Return letterboxed frames, spread evenly over what there is; synthetic scenes without a source."""
     if source is None:
         from trilitenet.data.synthetic import SyntheticScenes
@@ -370,8 +371,12 @@ def _canvases(source: Path | None, canvas: tuple[int, int], count: int, split: s
         scenes = SyntheticScenes(seed=0, size=canvas)
         images = [scenes[index].image for index in range(min(count, 4))]
     else:
-        images = [read_image(path) for path in find_pictures(source, count, split)]
-    return [Letterbox.fit(image.shape[:2], canvas=canvas).image(image) for image in images]
+        images = [read_image(path) for path in find_pictures(source, count, "val")]
+    return [_on_canvas(image, canvas) for image in images]
+
+
+def _on_canvas(image: NDArray[np.uint8], canvas: tuple[int, int]) -> NDArray[np.uint8]:
+    return Letterbox.fit(image.shape[:2], canvas=canvas).image(image)
 
 
 def find_pictures(source: Path, count: int, split: str) -> list[Path]:
@@ -512,12 +517,32 @@ class _Suppressed:
         return dataclasses.replace(raw, detection=rows[kept][None])
 
 
+class _Counted(Sequence[NDArray[Any]]):
+    """Inputs of which a bar shows how many have been taken, each time that somebody goes through them."""
+
+    def __init__(self, inputs: Sequence[NDArray[Any]], bar: ProgressBar) -> None:
+        self._inputs = inputs
+        self._bar = bar
+
+    def __len__(self) -> int:
+        return len(self._inputs)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._inputs[index]
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        for done, image in enumerate(self._inputs, 1):
+            self._bar(done, len(self))
+            yield image
+
+
 class _Drop:
     """The largest loss of a score in points on the val split, against the float32 network on the same pixels."""
 
-    def __init__(self, network: TriLiteNet, size: tuple[int, int] | None, data: Path) -> None:
+    def __init__(self, network: TriLiteNet, size: tuple[int, int] | None, data: Path, bar: ProgressBar) -> None:
         if not (data / "images" / "val").is_dir():
             raise ConfigError(f"--max-drop needs labels; {data} is not a data set with a val split")
+        self._bar = bar
         tasks = network.card.tasks
         self._keys = [DROP_SCORES[task] for task in tasks]
         self._dataset = drop_frames(data, network.card.class_names)
@@ -531,8 +556,9 @@ class _Drop:
         return max(100 * (value - after.get(key, 0.0)) for key, value in self._before.items())
 
     def _scores(self, backend: Backend) -> dict[str, float]:
+        self._bar.name("images measured")
         with Predictor(backend) as predictor:
-            figures = evaluate(predictor, self._dataset, resamples=0, worst=0, by=()).figures
+            figures = evaluate(predictor, self._dataset, resamples=0, worst=0, by=(), progress=self._bar).figures
         values = {key: figures[key].value for key in self._keys if key in figures}
         return {key: value for key, value in values.items() if math.isfinite(value)}
 
@@ -549,23 +575,29 @@ def _export_int8(
 ) -> Exported:
     """Quantise, and leave more and more parts in floating point until no score loses more than ``max_drop`` points."""
     canvas = info.size or network.card.input_size
-    inputs = [prepare_input(image, info) for image in _canvases(calibration, canvas, calibration_frames, split="train")]
-    budget = None if max_drop is None else _Drop(network, info.size, calibration)
     reason = ""
-    for keep in KEEP_STEPS if budget else KEEP_STEPS[1:2]:
-        candidate = quantize(inputs, keep)
-        drop = 0.0
-        if budget:
-            with scratch_folder() as folder:
-                trial = folder / path.name
-                _write(candidate, trial, network, info)
-                drop = budget.measure(_open(trial, info))
-        if max_drop is None or drop <= max_drop:
-            exported = _keep(network, candidate, info, path, checks)
-            kept = f"in floating point: {', '.join(keep) or 'nothing that can be quantised'}"
-            notes = (kept,) if max_drop is None else (kept, f"largest drop on val: {drop:.2f} points")
-            return dataclasses.replace(exported, notes=notes)
-        reason = f"{drop:.2f} points lost, at most {max_drop} allowed"
+    with show_progress("frames read") as bar:
+        pictures = find_pictures(calibration, calibration_frames, "train")
+        inputs = []
+        for picture in pictures:
+            inputs.append(prepare_input(_on_canvas(read_image(picture), canvas), info))
+            bar(len(inputs), len(pictures))
+        budget = None if max_drop is None else _Drop(network, info.size, calibration, bar)
+        for keep in KEEP_STEPS if budget else KEEP_STEPS[1:2]:
+            bar.name("frames calibrated with")
+            candidate = quantize(_Counted(inputs, bar), keep)
+            drop = 0.0
+            if budget:
+                with scratch_folder() as folder:
+                    trial = folder / path.name
+                    _write(candidate, trial, network, info)
+                    drop = budget.measure(_open(trial, info))
+            if max_drop is None or drop <= max_drop:
+                exported = _keep(network, candidate, info, path, checks)
+                kept = f"in floating point: {', '.join(keep) or 'nothing that can be quantised'}"
+                notes = (kept,) if max_drop is None else (kept, f"largest drop on val: {drop:.2f} points")
+                return dataclasses.replace(exported, notes=notes)
+            reason = f"{drop:.2f} points lost, at most {max_drop} allowed"
     raise BackendError(f"{path}: not written, INT8 costs too much even with most layers in floating point ({reason})")
 
 

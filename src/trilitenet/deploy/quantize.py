@@ -67,7 +67,7 @@ def quantize_openvino(model: Any, images: Sequence[NDArray[Any]], keep: Sequence
         nncf.set_log_level(logging.ERROR)
         return nncf.quantize(
             model,
-            nncf.Dataset(list(images)),
+            nncf.Dataset(images),
             preset=nncf.QuantizationPreset.PERFORMANCE,
             target_device=nncf.TargetDevice.CPU,
             subset_size=len(images),
@@ -111,7 +111,7 @@ def quantize_onnx(model: Any, images: Sequence[NDArray[Any]], keep: Sequence[str
 
     class Frames(quantization.CalibrationDataReader):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
-            self.rest: Iterator[Mapping[str, NDArray[Any]]] = iter([{"image": image} for image in images])
+            self.rest: Iterator[Mapping[str, NDArray[Any]]] = iter({"image": image} for image in images)
 
         def get_next(self) -> Mapping[str, NDArray[Any]] | None:
             return next(self.rest, None)
