@@ -45,7 +45,7 @@ test: $(DEVELOP) ## run the test suite
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) $(PYTEST_ARGS)
 
 lowest: ## run the test suite with the oldest versions that pyproject.toml allows, in .venv-lowest
-	$(PYTHON) -m venv .venv-lowest
+	$(MAKE) VENV=.venv-lowest .venv-lowest/bin/python
 	.venv-lowest/bin/python -m pip --disable-pip-version-check install --quiet uv
 	.venv-lowest/bin/uv pip install --quiet --python .venv-lowest/bin/python --resolution lowest-direct --editable ".[all,dev]"
 	OMP_NUM_THREADS=1 .venv-lowest/bin/python -m pytest -n $(JOBS) $(PYTEST_ARGS)

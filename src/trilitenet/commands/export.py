@@ -517,23 +517,23 @@ class _Suppressed:
         return dataclasses.replace(raw, detection=rows[kept][None])
 
 
-class _Counted(Sequence[NDArray[Any]]):
-    """Inputs of which a bar shows how many have been taken, each time that somebody goes through them."""
+class _Counted(Sequence[_Item]):
+    """Items of which a bar shows how many have been taken, each time that somebody goes through them."""
 
-    def __init__(self, inputs: Sequence[NDArray[Any]], bar: ProgressBar) -> None:
-        self._inputs = inputs
+    def __init__(self, items: Sequence[_Item], bar: ProgressBar) -> None:
+        self._items = items
         self._bar = bar
 
     def __len__(self) -> int:
-        return len(self._inputs)
+        return len(self._items)
 
     def __getitem__(self, index: Any) -> Any:
-        return self._inputs[index]
+        return self._items[index]
 
-    def __iter__(self) -> Iterator[NDArray[Any]]:
-        for done, image in enumerate(self._inputs, 1):
+    def __iter__(self) -> Iterator[_Item]:
+        for done, item in enumerate(self._items, 1):
             self._bar(done, len(self))
-            yield image
+            yield item
 
 
 class _Drop:
@@ -577,11 +577,8 @@ def _export_int8(
     canvas = info.size or network.card.input_size
     reason = ""
     with show_progress("frames read") as bar:
-        pictures = find_pictures(calibration, calibration_frames, "train")
-        inputs = []
-        for picture in pictures:
-            inputs.append(prepare_input(_on_canvas(read_image(picture), canvas), info))
-            bar(len(inputs), len(pictures))
+        pictures = _Counted(find_pictures(calibration, calibration_frames, "train"), bar)
+        inputs = [prepare_input(_on_canvas(read_image(picture), canvas), info) for picture in pictures]
         budget = None if max_drop is None else _Drop(network, info.size, calibration, bar)
         for keep in KEEP_STEPS if budget else KEEP_STEPS[1:2]:
             bar.name("frames calibrated with")

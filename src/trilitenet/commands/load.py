@@ -109,8 +109,9 @@ def open_backend(
     model: str | os.PathLike[str], device: str, backend: str, streams: int = 1, threads: int | None = None
 ) -> Backend:
     """Open a file on the runtime asked for, or on the fastest one here that runs it."""
-    suffix, fastest = Path(model).suffix.lower(), backend == "auto"
-    if str(model) not in VARIANTS and Path(model).is_dir() and any(Path(model).glob("*.param")):
+    path = Path(os.fspath(model))
+    suffix, fastest = path.suffix.lower(), backend == "auto"
+    if str(model) not in VARIANTS and path.is_dir() and any(path.glob("*.param")):
         suffix = ".param"
     runs = _RUNS.get(suffix, ("torch",))
     if backend == "auto":

@@ -166,13 +166,14 @@ def _connect(fabric: Any, devices: int, num_nodes: int) -> None:
     try:
         fabric.launch()
     except RuntimeError as error:
+        taken = "EADDRINUSE" in str(error)  # no DistError in PyTorch 2.6
+        if not taken and not isinstance(error, torch.distributed.DistError):
+            raise
         port = os.environ["MASTER_PORT"]
-        if "EADDRINUSE" in str(error):  # of PyTorch 2.6 no DistError
+        if taken:
             raise ConfigError(
                 f"port {port}, at which the processes are to meet, is taken; set MASTER_PORT to a free one, or unset it"
             ) from error
-        if not isinstance(error, torch.distributed.DistError):
-            raise
         raise TrainingError(
             f"the processes cannot meet at {os.environ['MASTER_ADDR']}:{port} ({str(error).splitlines()[0]}); "
             "see that the first one runs, and that MASTER_ADDR and MASTER_PORT name its machine and a free port"

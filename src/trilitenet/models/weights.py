@@ -94,7 +94,7 @@ def resolve_weights(model: str | os.PathLike[str]) -> Path:
     shipped = shipped_weights()
     if isinstance(model, str) and model in shipped:
         return shipped[model]
-    path = Path(model)
+    path = Path(os.fspath(model))  # whose message about another type is the same in every Python
     if path.is_file():
         return path
     if isinstance(model, str) and model in VARIANTS:
