@@ -22,7 +22,7 @@ _jit: Any = torch.jit
 NARROW = 4
 """Up to so many channels, `batch_norm_prelu` normalises bf16 by rows too; 32-bit floats always, for exactness."""
 
-BLOCK = 2**19
+BLOCK = 2**18
 """Values worked on at once: a few such blocks fit a core's second-level cache or its share of the third."""
 
 
@@ -123,13 +123,35 @@ def _per_channel(sums: Tensor, channels: int) -> Tensor:
     return sums.view(-1, channels).sum(0)
 
 
-def _slope_gradients(grad: Tensor, z: Tensor, slope: Tensor, out: Tensor) -> Tensor:
+def _room(rows: Tensor, count: int) -> list[Tensor]:
+    """Return ``count`` tensors for a block each, which stay in the cache as no new ones do."""
+    size = max((len(rows[block]) for block in _blocks(rows)), default=0)
+    return list(torch.empty(count, size, rows.shape[1], dtype=_full(rows)))
+
+
+def _moments(rows: Tensor, channels: int, spare: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the mean and the variance (C,) of (R, W C): those of the blocks, joined (Chan et al., 1979)."""
+    mean, squares = torch.zeros(2, channels, dtype=spare.dtype)
+    before = 0
+    for block in _blocks(rows):
+        part = rows[block]
+        count = part.numel() // channels
+        own = _per_channel(part.sum(0, dtype=spare.dtype), channels) / count
+        apart = torch.sub(part, own.repeat(part.shape[1] // channels), out=spare[: len(part)])
+        step = own - mean
+        mean = mean + step * (count / (before + count))
+        squares = squares + _per_channel(apart.square_().sum(0), channels)
+        squares = squares + step.square() * (before * count / (before + count))
+        before += count
+    return mean, squares / before
+
+
+def _slope_gradients(grad: Tensor, z: Tensor, slope: Tensor, out: Tensor, spare: Tensor) -> Tensor:
     """Write the gradient of PReLU's input (R, W C) to ``out``; return that of its slope, summed over rows, (W C,)."""
-    positive = torch.ops.aten.threshold_backward(grad, z, 0)  # the gradient where z > 0, else 0
-    negative = grad - positive
-    torch.addcmul(positive, negative, slope, out=out)
-    summed: Tensor = negative.mul_(z).sum(0, dtype=_full(z))
-    return summed
+    torch.ops.aten.threshold_backward.grad_input(grad, z, 0, grad_input=out)  # the gradient where z > 0, else 0
+    negative = torch.sub(grad, out, out=spare[: len(grad)])
+    torch.addcmul(out, negative, slope, out=out)
+    return negative.mul_(z).sum(0)
 
 
 class _RowPReLU(torch.autograd.Function):
@@ -147,12 +169,15 @@ class _RowPReLU(torch.autograd.Function):
         rows, of_out = _rows(x), _rows(grad)
         of_x = torch.empty_like(rows)
         of_slope = torch.zeros(rows.shape[1], dtype=_full(x))
+        (spare,) = _room(rows, 1)
         for block in _blocks(rows):
-            of_slope += _slope_gradients(of_out[block], rows[block], tiled, of_x[block])
+            of_slope += _slope_gradients(of_out[block], rows[block], tiled, of_x[block], spare)
         return _image(of_x, x.shape), _per_channel(of_slope, x.shape[1]).to(slope.dtype)
 
 
 class _RowBatchNormPReLU(torch.autograd.Function):
+    """Keeps its input alone for the gradient: what it normalised is cheaper to compute again than to read back."""
+
     @staticmethod
     def forward(
         ctx: Any,
@@ -168,57 +193,53 @@ class _RowBatchNormPReLU(torch.autograd.Function):
         channels, width = x.shape[1], x.shape[3]
         count = x.numel() // channels
         rows = _rows(x)
-        blocks = _blocks(rows)
-        sums = torch.zeros(rows.shape[1], dtype=_full(x))
-        for block in blocks:
-            sums += rows[block].sum(0, dtype=sums.dtype)
-        mean = _per_channel(sums, channels) / count
-        means = mean.repeat(width)
-        squares = torch.zeros_like(sums)
-        for block in blocks:
-            squares += (rows[block] - means).square_().sum(0)
-        variance = _per_channel(squares, channels) / count
+        (spare,) = _room(rows, 1)
+        mean, variance = _moments(rows, channels, spare)
         running_mean.lerp_(mean.to(running_mean.dtype), momentum)
         running_var.lerp_((variance * (count / max(count - 1, 1))).to(running_var.dtype), momentum)
         inverse = (variance + eps).rsqrt()
-        scales, shifts = (weight * inverse).repeat(width), bias.repeat(width)
-        slopes = slope.to(x.dtype).repeat(width)
-        z, out = torch.empty_like(rows), torch.empty_like(rows)
-        for block in blocks:
-            z[block] = torch.addcmul(shifts, rows[block] - means, scales)
-            out[block] = torch._prelu_kernel(z[block], slopes)
-        ctx.save_for_backward(x, z, weight, slope, mean, inverse)
+        means, scales, shifts = mean.repeat(width), (weight * inverse).repeat(width), bias.repeat(width)
+        slopes = slope.to(mean.dtype).repeat(width)
+        out = torch.empty_like(rows)
+        for block in _blocks(rows):
+            part = rows[block]
+            z = torch.sub(part, means, out=spare[: len(part)])
+            out[block] = torch._prelu_kernel(torch.addcmul(shifts, z, scales, out=z), slopes)
+        ctx.save_for_backward(x, weight, bias, slope, mean, inverse)
         return _image(out, x.shape)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        x, z, weight, slope, mean, inverse = ctx.saved_tensors
+        x, weight, bias, slope, mean, inverse = ctx.saved_tensors
         channels, width = x.shape[1], x.shape[3]
         count = x.numel() // channels
         rows, of_out = _rows(x), _rows(grad)
         blocks = _blocks(rows)
-        means, slopes = mean.repeat(width), slope.to(z.dtype).repeat(width)
-        of_z = torch.empty_like(of_out)
+        scale = weight * inverse
+        means, scales, shifts = mean.repeat(width), scale.repeat(width), bias.repeat(width)
+        slopes = slope.to(mean.dtype).repeat(width)
+        of_z = torch.empty_like(of_out, dtype=mean.dtype)
         sums = torch.zeros(3, rows.shape[1], dtype=mean.dtype)
+        *room, spare = _room(rows, 3)
         for block in blocks:
-            sums[0] += _slope_gradients(of_out[block], z[block], slopes, of_z[block])
-            part = of_z[block].to(mean.dtype)
+            part = of_z[block]
+            centred, z = (each[: len(part)] for each in room)
+            torch.addcmul(shifts, torch.sub(rows[block], means, out=centred), scales, out=z)
+            sums[0] += _slope_gradients(of_out[block].to(part.dtype), z, slopes, part, spare)
             sums[1] += part.sum(0)
-            sums[2] += (rows[block] - means).mul_(part).sum(0)
+            sums[2] += centred.mul_(part).sum(0)
         of_slope, of_bias, of_weight = (_per_channel(each, channels) for each in sums)
         of_weight = of_weight * inverse
         # d/dx = weight / std (g - mean of g - normalised x * mean of (g * normalised x))
-        scale = weight * inverse
-        by_gradient = scale.repeat(width)
         by_input = (scale * inverse * of_weight / -count).repeat(width)
         constant = (scale * of_bias / -count).repeat(width)
-        of_x = torch.empty_like(rows)
         for block in blocks:
-            part = torch.addcmul(constant, rows[block] - means, by_input)
-            of_x[block] = part.addcmul_(of_z[block].to(mean.dtype), by_gradient)
+            part = of_z[block]
+            others = torch.sub(rows[block], means, out=spare[: len(part)])
+            torch.addcmul(torch.addcmul(constant, others, by_input, out=others), part, scales, out=part)
         return (
-            _image(of_x, x.shape),
+            _image(of_z.to(x.dtype), x.shape),
             of_weight.to(weight.dtype),
             of_bias.to(weight.dtype),
             of_slope.to(slope.dtype),
