@@ -131,6 +131,20 @@ def test_what_is_no_report_is_refused(tmp_path: Path, report: Report) -> None:
     path.write_text(json.dumps(report.to_dict() | {"schema": "one"}))
     with pytest.raises(DataError, match="not a report"):
         read_report(path)
+    whole = report.to_dict()
+    for part, key, value in (
+        ("provenance", "model", ["tiny"]),
+        ("provenance", "settings", []),
+        ("provenance", "data_sha256", 3),
+        ("provenance", "thresholds", {"confidence": "much"}),
+        ("state", "fair", []),
+    ):
+        path.write_text(json.dumps(whole | {part: whole[part] | {key: value}}))
+        with pytest.raises(DataError, match="not a report"):
+            read_report(path)
+    path.write_text(json.dumps(whole | {"images": whole["images"][1:]}))
+    with pytest.raises(DataError, match="not a report"):
+        read_report(path)
     path.write_text(json.dumps(report.to_dict() | {"schema": 99}))
     with pytest.raises(DataError, match=r"report\.json: report schema 99 is newer than 1; upgrade trilitenet$"):
         read_report(path)

@@ -211,7 +211,8 @@ def _why_unpaired(first: Report, other: Report) -> dict[str, str]:
             found[f"/{task}/"] = f"measured with other labels of {part}"
     classes = [report.state.get("fair", {}).get("detection", {}).get("class_names") for report in (first, other)]
     if None not in classes and classes[0] != classes[1]:
-        found["/detection/"] = f"tells {', '.join(classes[1])}, the first {', '.join(classes[0])}"
+        told = [", ".join(map(str, names)) for names in classes]
+        found["/detection/"] = f"tells {told[1]}, the first {told[0]}"
     batches = [report.provenance.settings.get("paper_batch") for report in (first, other)]
     saved = [report.provenance.runtime == SAVED for report in (first, other)]
     if None not in batches and batches[0] != batches[1]:

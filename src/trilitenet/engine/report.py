@@ -12,12 +12,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from trilitenet.config import parse_json
+from trilitenet.config import parse, parse_json
 from trilitenet.engine.figures import CONDITION_FIGURES, HEADLINES, meaning
 from trilitenet.engine.page import percent
 from trilitenet.engine.scoring import FairMetrics, FairScores, PaperMetrics, PaperScores
@@ -393,11 +394,15 @@ def read_report(path: Path) -> Report:
             raise DataError(f"{path}: report schema {schema!r} is newer than {REPORT_SCHEMA}; upgrade trilitenet")
         state = mapping["state"]
         known = mapping["provenance"]
-        known |= {"canvas": tuple(known["canvas"]), "peak_memory_mib": _number(known["peak_memory_mib"])}
-        scores: dict[str, Any] = {name: metrics.compute() for name, metrics in _metrics(state).items()}
+        known |= {"peak_memory_mib": _number(known["peak_memory_mib"])}
+        names = tuple(mapping["images"])
+        scores: dict[str, Any] = {}
+        for name, metrics in _metrics(state).items():
+            scores[name] = metrics.compute()
+            metrics.figures(np.ones((1, len(names)), np.int32))  # as many images as the names
         plots = mapping["detection_plots"]
         return Report(
-            provenance=Provenance(**known),
+            provenance=parse(Provenance, known, "provenance"),
             fair=scores.get("fair"),
             paper=scores.get("paper"),
             figures={
@@ -418,7 +423,7 @@ def read_report(path: Path) -> Report:
                 WorstFrame(frame["task"], frame["name"], _number(frame["score"]), frame["note"])
                 for frame in mapping["worst"]
             ),
-            names=tuple(mapping["images"]),
+            names=names,
             state=state,
             variations=tuple(
                 Variation(
@@ -441,7 +446,7 @@ def read_report(path: Path) -> Report:
 
 def _metrics(state: Mapping[str, Any]) -> dict[str, FairMetrics | PaperMetrics]:
     readers: dict[str, Any] = {"fair": FairMetrics.from_state, "paper": PaperMetrics.from_state}
-    return {name: readers[name](part) for name, part in state.items()}
+    return {name: readers[name]({**part}) for name, part in state.items()}
 
 
 def _plots(mapping: Mapping[str, Any]) -> DetectionPlots:
