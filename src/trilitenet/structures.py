@@ -38,7 +38,7 @@ class Boxes:
         track_id: (N,) int64, the object's identity over the frames of a video, -1 where unknown; None without tracking.
 
     Raises:
-        ShapeError: If the arrays do not fit each other, or are no such arrays.
+        ShapeError: If the arrays do not fit each other, or are no such arrays, or hold numbers that are not finite.
     """
 
     xyxy: NDArray[np.float32]
@@ -61,6 +61,8 @@ class Boxes:
             array = getattr(self, name)
             if array is not None and array.shape != (count,):
                 raise ShapeError(f"{name} must be ({count},) like xyxy, got {array.shape}")
+        if not (np.isfinite(self.xyxy).all() and np.isfinite(self.confidence).all()):
+            raise ShapeError("xyxy and confidence must be finite numbers")
 
     def __len__(self) -> int:
         return len(self.xyxy)

@@ -12,6 +12,8 @@ from trilitenet.engine.predictions import PredictionWriter, SavedPredictions
 from trilitenet.errors import DataError, OutputError
 from trilitenet.structures import Boxes, Perception
 
+BOX = '{"image_id": "a", "category_id": 1, "bbox": [0, 0, 1, 1], "score": 0.5}'
+
 
 def perception(rng: np.random.Generator, boxes: int) -> Perception:
     low = rng.uniform(0, 20, (boxes, 2))
@@ -117,6 +119,11 @@ def test_a_part_that_is_not_there_is_a_task_that_is_not_scored(tmp_path: Path) -
         ('[{"image_id": "a", "category_id": 0, "bbox": [0, 0, 1, 1], "score": 0.5}]', "category_id 0 is not 1 to 2"),
         ('[{"image_id": "a", "category_id": 3, "bbox": [0, 0, 1, 1], "score": 0.5}]', "category_id 3 is not 1 to 2"),
         ("[{", "not COCO results"),
+        (f"[{BOX} {BOX}]", "not one JSON list, at character"),
+        (f"[{BOX}] {BOX}", "not one JSON list, at character"),
+        (f"[{BOX}", "not one JSON list, at character"),
+        (f"[{BOX},]", "not COCO results"),
+        (f"[,{BOX}]", "not COCO results"),
         ("", "not COCO results"),
         ('[{"image_id": "a", "category_id": Infinity, "bbox": [0, 0, 1, 1], "score": 0.5}]', "not COCO results"),
         pytest.param("[" * 500_000, "nested too deeply", id="deep"),
@@ -185,7 +192,7 @@ def test_what_is_interrupted_does_not_look_whole(tmp_path: Path, rng: np.random.
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("value", ["NaN", "Infinity"])
+@pytest.mark.parametrize("value", ["NaN", "Infinity", "1e300"])
 def test_a_box_that_is_not_finite_is_named(tmp_path: Path, value: str) -> None:
     (tmp_path / "detections.json").write_text(
         f'[{{"image_id": "a", "category_id": 1, "bbox": [{value}, 1, 5, 5], "score": 0.5}}]'

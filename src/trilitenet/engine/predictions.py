@@ -18,7 +18,6 @@ import array
 import contextlib
 import json
 import logging
-import math
 import re
 import shlex
 import shutil
@@ -234,8 +233,8 @@ class SavedPredictions:
                 category = int(entry["category_id"])
                 categories.add(category)
                 number = self._class(category, path)
-                if not all(map(math.isfinite, (left, top, width, height))):
-                    raise DataError(f"{path}: a bbox must be four numbers, got {entry['bbox']}")
+                if not all(abs(value) < 1e9 for value in (left, top, width, height)):
+                    raise DataError(f"{path}: a bbox must be four numbers of pixels, got {entry['bbox']}")
                 score = float(entry["score"])
                 if not 0 <= score <= 1:
                     raise DataError(f"{path}: a score must be between 0 and 1, got {score}")
@@ -276,17 +275,25 @@ def _entries(text: str) -> Iterator[dict[str, Any]]:
         ValueError: If it is not a JSON list, or is nested too deeply.
     """
     decoder = json.JSONDecoder()
-    gap = re.compile(r"[\s,]*")
-    at = len(text) - len(text.lstrip())
+    space = re.compile(r"\s*")
+
+    def skip(at: int) -> int:
+        return space.match(text, at).end()  # type: ignore[union-attr]
+
+    at = skip(0)
     if text[at : at + 1] != "[":
         raise ValueError("no list")
-    at += 1
-    while True:
-        at = gap.match(text, at).end()  # type: ignore[union-attr]
-        if text[at : at + 1] == "]":
-            return
+    at = skip(at + 1)
+    more = text[at : at + 1] != "]"
+    while more:
         try:
             entry, at = decoder.raw_decode(text, at)
         except RecursionError as error:
             raise ValueError("nested too deeply") from error
         yield entry
+        at = skip(at)
+        more = text[at : at + 1] == ","
+        if more:
+            at = skip(at + 1)
+    if text[at : at + 1] != "]" or skip(at + 1) < len(text):
+        raise ValueError(f"not one JSON list, at character {at}")
