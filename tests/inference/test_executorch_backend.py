@@ -142,7 +142,7 @@ def test_the_extra_is_named(program: Path, monkeypatch: pytest.MonkeyPatch) -> N
         ExecuTorchBackend(program)
 
 
-def test_int8_leaves_whole_parts_in_floating_point() -> None:
+def test_int8_leaves_whole_parts_and_depthwise_convolutions_in_floating_point() -> None:
     network = lively_network()
     info = ArtefactInfo("executorch", "int8", SIZE, input="float_nchw", masks="logit", trilitenet="0")
     traceable = Traceable(DeployGraph(network, LAYOUTS["planar"], masks="logit"), network.card, info)
@@ -153,6 +153,10 @@ def test_int8_leaves_whole_parts_in_floating_point() -> None:
         lowered = _folded(torch.export.export(made, (traceable.image,)).run_decompositions({}))
     weights = [node for node in lowered.graph.nodes if "dequantize_per_channel" in str(node.target)]
     assert len(weights) > 20
+    convolutions = [node for node in made.graph.nodes if str(node.target) == "aten.conv2d.default"]
+    depthwise = [node for node in convolutions if len(node.args) > 6 and node.args[6] > 1]
+    assert len(depthwise) > 10
+    assert not any("dequantize" in str(node.args[1].target) for node in depthwise)
     found: dict[bool, set[str]] = {True: set(), False: set()}
     for node in made.graph.nodes:
         modules = ".".join(path for path, _ in node.meta.get("nn_module_stack", {}).values())

@@ -74,17 +74,24 @@ def _folded(program: Any) -> Any:
 
 
 def _quantised(program: Any, images: Sequence[NDArray[Any]], keep: Sequence[str]) -> Any:
-    """Return the module of an exported program with static INT8: weights symmetric a channel, activations a tensor."""
+    """Return the module of an exported program with static INT8: weights symmetric a channel, activations a tensor.
+
+    Depthwise convolutions stay in floating point.
+    """
     xnnpack = import_extra("executorch.backends.xnnpack.quantizer.xnnpack_quantizer", "executorch")
     pt2e = import_extra("torchao.quantization.pt2e.quantize_pt2e", "executorch")
 
     class Quantizer(xnnpack.XNNPACKQuantizer):  # type: ignore[misc, name-defined]
         def annotate(self, model: torch.fx.GraphModule) -> torch.fx.GraphModule:
-            """Mark what is quantised. Its own filter forgets concatenations: boxes and scores would share a scale."""
+            """Mark what is quantised: all but depthwise convolutions, which cost points of AP50, and what is kept.
+
+            The quantiser's own filter of modules forgets concatenations: boxes and scores would share a scale.
+            """
             model = super().annotate(model)
             for node in model.graph.nodes:
                 modules = (path for path, _ in node.meta.get("nn_module_stack", {}).values())
-                if kept_nodes(["/".join(modules).replace(".", "/")], keep):
+                groups = node.args[6] if str(node.target) == "aten.conv2d.default" and len(node.args) > 6 else 1
+                if groups > 1 or kept_nodes(["/".join(modules).replace(".", "/")], keep):
                     node.meta.pop("quantization_annotation", None)
             return model
 
