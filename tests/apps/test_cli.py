@@ -478,6 +478,20 @@ def test_what_commands_write_by_themselves_on_a_full_disk_is_told(
     assert capsys.readouterr().err == "error: standard output: cannot be written (No space left on device)\n"
 
 
+@pytest.mark.parametrize(
+    ("words", "told"), [((), ""), (("Unable to allocate 7.28 TiB",), " (Unable to allocate 7.28 TiB)")]
+)
+def test_memory_that_runs_out_is_one_line(
+    words: tuple[str, ...], told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(*_: object, **__: object) -> None:
+        raise MemoryError(*words)
+
+    monkeypatch.setattr(cli, "build_app", lambda _: run)
+    assert cli.main(["train"]) == 1
+    assert capsys.readouterr().err == f"error: memory ran out{told}; ask for less at once, or make room\n"
+
+
 def test_an_interruption_before_the_command_line_is_there_is_no_traceback(tmp_path: Path) -> None:
     (tmp_path / "cyclopts.py").write_text("raise KeyboardInterrupt\n")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}

@@ -225,6 +225,8 @@ def main(words: Sequence[str] | None = None) -> int:
         return _fail(str(error), code=1)
     except KeyboardInterrupt:
         return _fail("interrupted", code=130)
+    except MemoryError as error:
+        return _fail(f"memory ran out{f' ({error})' if str(error) else ''}; ask for less at once, or make room", code=1)
     except BrokenPipeError:  # the reader, such as `head`, has gone
         _discard_output()
     except OSError as error:
