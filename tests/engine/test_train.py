@@ -274,7 +274,7 @@ def test_what_is_best_is_found_anew_on_other_validation_data(tmp_path: Path) -> 
     [
         MemoryError("Unable to allocate 2.00 GiB for an array"),
         RuntimeError("[enforce fail at alloc_cpu.cpp:127] err == 0. DefaultCPUAllocator: can't allocate memory: ..."),
-        BackendError("torch cuda is out of memory for 8 images of 640x384; use a smaller batch"),
+        BackendError("torch cuda is out of memory for 8 images of 640x384; use a smaller batch or a smaller size"),
     ],
 )
 def test_a_validation_without_memory_is_done_anew_by_resuming(tmp_path: Path, error: Exception) -> None:

@@ -78,13 +78,25 @@ def test_sizes_that_are_no_multiple_of_32_are_refused(backend: TorchBackend) -> 
         backend.run(np.zeros((1, 64, 90, 3), np.uint8))
 
 
-def test_too_large_a_batch_is_one_line(backend: TorchBackend, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "error",
+    [
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate ..."),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:127] err == 0. DefaultCPUAllocator: can't allocate memory: ..."),
+        MemoryError(),
+    ],
+)
+def test_too_large_a_batch_is_one_line(
+    error: Exception, backend: TorchBackend, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def forward(*_: object) -> None:
-        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate ...")
+        raise error
 
     monkeypatch.setattr(backend.network, "forward", forward)
-    with pytest.raises(BackendError, match="torch cpu is out of memory for 2 images of 96x64; use a smaller batch"):
+    with pytest.raises(BackendError, match="torch cpu is out of memory for 2 images of 96x64; use a smaller batch or"):
         backend.run(np.zeros((2, 64, 96, 3), np.uint8))
+    with pytest.raises(BackendError, match="torch cpu is out of memory for an image of 96x64; use a smaller size"):
+        backend.run(np.zeros((1, 64, 96, 3), np.uint8))
 
 
 @pytest.mark.parametrize("device", ["cuda:99", "nonsense", "meta:x", "hpu"])

@@ -43,15 +43,13 @@ from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.losses.multitask import LossTerms, MultiTaskLoss
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
 from trilitenet.models.weights import read_card, save_network
+from trilitenet.processing.memory import lacks_memory
 
 __all__ = ["CHECKPOINT_NAME", "FIGURES", "TrainResult", "Trainer", "figures_in_words", "holds_run"]
 
 
 CHECKPOINT_NAME: Final = "last.ckpt"
 """The checkpoint in the run's folder that `--resume` continues from."""
-
-_NO_MEMORY: Final = "DefaultCPUAllocator"
-"""What PyTorch's RuntimeError names where a CPU has no memory left; of other devices there is a class of errors."""
 
 _RESULTS: Final = (CHECKPOINT_NAME, "final.safetensors", "best-*.safetensors")
 _TRACES: Final = ("config.yaml", "metrics.csv", "results", "tensorboard")
@@ -287,7 +285,7 @@ class Trainer:
         except (DataError, OutputError) as error:  # it came between two steps
             raise type(error)(f"{error}; once that is mended, {self._keep()}") from error
         except RuntimeError as error:
-            if _lacks_memory(error):
+            if lacks_memory(error):
                 height, width = self.config.input_size
                 raise TrainingError(
                     f"{self.fabric.device} is out of memory in step {self.step} (a batch of {self.config.batch_size} "
@@ -469,7 +467,7 @@ class Trainer:
         except _LeftValidationError:
             return False
         except (RuntimeError, MemoryError) as error:
-            if not (_lacks_memory(error) or _lacks_memory(error.__cause__)):
+            if not (lacks_memory(error) or lacks_memory(error.__cause__)):
                 raise
             raise TrainingError(
                 f"{self.fabric.device} is out of memory in the validation after step {self.step}; make room, or go "
@@ -660,11 +658,6 @@ class Trainer:
                 continue
             if value > self.best.get(name, -math.inf):
                 self._ahead[name] = value
-
-
-def _lacks_memory(error: BaseException | None) -> bool:
-    """Return whether an error is that memory is used up."""
-    return isinstance(error, (torch.OutOfMemoryError, MemoryError)) or _NO_MEMORY in str(error)
 
 
 def _changes(before: Mapping[str, Any], after: Mapping[str, Any], within: str = "") -> Iterator[str]:

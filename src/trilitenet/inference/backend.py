@@ -16,7 +16,16 @@ from trilitenet.errors import BackendError, ShapeError
 from trilitenet.processing.cores import usable_cores
 from trilitenet.structures import RawOutputs
 
-__all__ = ["MOST_PARALLEL", "Backend", "ParallelSessions", "check_batch", "check_process", "held", "replaced"]
+__all__ = [
+    "MOST_PARALLEL",
+    "Backend",
+    "ParallelSessions",
+    "check_batch",
+    "check_process",
+    "held",
+    "out_of_memory",
+    "replaced",
+]
 
 T = TypeVar("T")
 
@@ -39,6 +48,13 @@ def check_batch(batch: NDArray[np.uint8], stride: int = 1) -> None:
     height, width = batch.shape[1:3]
     if height % stride or width % stride:
         raise ShapeError(f"the sides of images must be multiples of {stride} pixels, got {width}x{height}")
+
+
+def out_of_memory(name: str, batch: NDArray[np.uint8]) -> BackendError:
+    """Return the error of a backend of that name whose memory did not do for a (B, H, W, 3) batch."""
+    count, height, width = batch.shape[:3]
+    what, less = ("an image", "") if count == 1 else (f"{count} images", "a smaller batch or ")
+    return BackendError(f"{name} is out of memory for {what} of {width}x{height}; use {less}a smaller size")
 
 
 def check_process(opened_in: int) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from trilitenet.config import MAX_STRIDE, TASKS, ModelCard
 from trilitenet.errors import BackendError
-from trilitenet.inference.backend import check_batch, held
+from trilitenet.inference.backend import check_batch, held, out_of_memory
 from trilitenet.inference.torch_backend import pick_device
 from trilitenet.structures import RawOutputs
 
@@ -85,10 +85,7 @@ class CudaGraphBackend:
             try:
                 captured = self._get(batch.shape)
             except torch.OutOfMemoryError as error:
-                raise BackendError(
-                    f"{self.name} is out of memory for {len(batch)} images of {batch.shape[2]}x{batch.shape[1]}; "
-                    "use a smaller batch"
-                ) from error
+                raise out_of_memory(self.name, batch) from error
             captured.host.numpy()[:] = batch
             captured.pixels.copy_(captured.host, non_blocking=True)
             captured.graph.replay()

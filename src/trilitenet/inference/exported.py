@@ -139,7 +139,10 @@ class ArtefactBackend(abc.ABC):
         except TriLiteNetError:
             raise
         except Exception as error:  # what runtimes raise shares no base class
-            raise BackendError(f"the runtime failed ({' '.join(str(error).split())[:160]})") from error
+            words = " ".join(str(error).split())
+            if len(words) > 200:  # OpenVINO begins with its files and ends with the cause
+                words = f"{words[:80]} ... {words[-115:]}"
+            raise BackendError(f"the runtime failed ({words})") from error
 
         def mask(name: str) -> NDArray[np.uint8] | None:
             if name not in card.tasks:

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from trilitenet.config import ModelCard
 from trilitenet.errors import BackendError
-from trilitenet.inference.backend import MOST_PARALLEL, check_batch, held
+from trilitenet.inference.backend import MOST_PARALLEL, check_batch, held, out_of_memory
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
+from trilitenet.processing.memory import lacks_memory
 from trilitenet.structures import RawOutputs
 
 __all__ = ["TorchBackend", "check_threads", "pick_device"]
@@ -119,11 +120,10 @@ class TorchBackend:
                     drivable=None if outputs.drivable is None else _foreground(outputs.drivable),
                     lane=None if outputs.lane is None else _foreground(outputs.lane),
                 )
-        except torch.OutOfMemoryError as error:
-            raise BackendError(
-                f"{self.name} is out of memory for {len(batch)} images of {batch.shape[2]}x{batch.shape[1]}; "
-                "use a smaller batch"
-            ) from error
+        except (RuntimeError, MemoryError) as error:
+            if not lacks_memory(error):
+                raise
+            raise out_of_memory(self.name, batch) from error
 
     @contextlib.contextmanager
     def in_parallel(self) -> Iterator[int]:

@@ -1,4 +1,4 @@
-"""The allocator: freed memory is kept for what needs the same again, not given back to the system page by page."""
+"""The allocator: freed memory is kept for what needs the same again; and errors that say that none is left."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import ctypes
 import sys
 from typing import Final
 
-__all__ = ["IMAGES", "STEPS", "keep_freed_memory"]
+__all__ = ["IMAGES", "STEPS", "keep_freed_memory", "lacks_memory"]
 
 _TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD, _MMAP_MAX, _ARENA_MAX = -1, -2, -3, -4, -8
 """Options of glibc's ``mallopt``."""
@@ -22,3 +22,15 @@ def keep_freed_memory(options: tuple[tuple[int, int], ...]) -> bool:
     """Set `STEPS` or `IMAGES`; return whether the C library took them: one that is not glibc does not."""
     mallopt = getattr(ctypes.CDLL(None) if sys.platform == "linux" else None, "mallopt", None)
     return mallopt is not None and all(mallopt(option, value) for option, value in options)
+
+
+def lacks_memory(error: BaseException | None) -> bool:
+    """Return whether an error of Python, NumPy or PyTorch says that memory is used up.
+
+    PyTorch has a class of errors for devices, and names its allocator where a CPU has no memory left.
+    """
+    return (
+        isinstance(error, MemoryError)
+        or type(error).__name__ == "OutOfMemoryError"
+        or (isinstance(error, RuntimeError) and "DefaultCPUAllocator" in str(error))
+    )
