@@ -247,6 +247,19 @@ def test_what_a_runtime_cannot_take_is_one_line(artefacts: Artefacts, kind: Any)
     backend.run(np.zeros((1, *SIZE, 3), np.uint8))
 
 
+def test_the_cause_at_the_end_of_a_long_error_is_told(artefacts: Artefacts, monkeypatch: pytest.MonkeyPatch) -> None:
+    def compute(_: object) -> None:
+        raise RuntimeError(
+            "Exception from src/inference/src/cpp/infer_request.cpp:246:\n" * 5 + "Failed to allocate\n\n"
+        )
+
+    backend = OnnxBackend(artefacts.folder / "model.onnx")
+    monkeypatch.setattr(backend, "_compute", compute)
+    with pytest.raises(BackendError, match=r"^the runtime failed \(Exception .*Failed to allocate\)$") as caught:
+        backend.run(np.zeros((1, *SIZE, 3), np.uint8))
+    assert len(str(caught.value)) < 230
+
+
 @pytest.mark.parametrize(
     ("name", "kind"), [("x.onnx", OnnxBackend), ("x.onnx", OpenVINOBackend), ("x.xml", OpenVINOBackend)]
 )
