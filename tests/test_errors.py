@@ -17,6 +17,7 @@ from trilitenet.errors import (
     OutputError,
     did_you_mean,
     few,
+    gist,
     import_extra,
     needing_torch,
     part_of,
@@ -44,6 +45,14 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
             interrupt(path, error)
         assert path.read_text() == "new"
         assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_long_error_of_another_library_keeps_its_beginning_and_its_end_on_one_line() -> None:
+    assert gist(RuntimeError("no\n  room")) == "no room"
+    told = gist(RuntimeError("Exception from " + "src/a.cpp:1:\n" * 99 + "the device is lost"))
+    assert told.startswith("Exception from src/a.cpp:1:")
+    assert told.endswith("the device is lost")
+    assert len(told) == len(gist(RuntimeError("x" * 200))) == 200
 
 
 def test_writing_tells_the_cause_in_one_line(tmp_path: Path) -> None:
@@ -176,6 +185,13 @@ def test_only_pytorch_itself_is_told_to_be_missing(name: str, told: bool) -> Non
     with pytest.raises(MissingExtraError if told else ModuleNotFoundError) as caught, needing_torch():
         raise ModuleNotFoundError(f"No module named {name!r}", name=name)
     assert isinstance(caught.value, MissingExtraError) == told
+
+
+def test_the_pytorch_that_is_asked_for_is_the_one_that_is_required() -> None:
+    with pytest.raises(MissingExtraError) as caught, needing_torch():
+        raise ModuleNotFoundError("No module named 'torch'", name="torch")
+    asked = str(caught.value).split("'")[1]
+    assert f'"{asked}",' in (Path(__file__).parents[1] / "pyproject.toml").read_text()
 
 
 def test_an_import_that_is_interrupted_is_not_taken_for_a_missing_extra(

@@ -56,6 +56,7 @@ __all__ = [
     "did_you_mean",
     "few",
     "folder_beside",
+    "gist",
     "import_extra",
     "part_of",
     "replacing",
@@ -72,7 +73,9 @@ LONGEST_NAME: Final = 255
 _BEGINNING: Final = 40
 """Characters of a long file name, of up to four bytes each, that its temporary name keeps."""
 _MOST_SHOWN: Final = 200
-"""Characters of a value that a message shows."""
+"""Characters of a value, or of another library's error, that a message shows."""
+_END: Final = 115
+"""Characters of a long error's end that are among them."""
 
 
 class TriLiteNetError(Exception):
@@ -123,6 +126,14 @@ def brief(error: BaseException) -> str:
     if isinstance(error, KeyError):
         return f"{error} is missing"
     return f"{type(error).__name__}: {error}" if isinstance(error, UnicodeError) else repr(error)
+
+
+def gist(error: BaseException) -> str:
+    """Return on one line what another library says; of a long text its beginning and its end, where causes stand."""
+    text = " ".join(str(error).split())
+    if len(text) <= _MOST_SHOWN:
+        return text
+    return f"{text[: _MOST_SHOWN - _END - 5]} ... {text[-_END:]}"
 
 
 def shown(value: object) -> str:
@@ -196,7 +207,7 @@ def needing_torch() -> Iterator[None]:
         if (error.name or "").partition(".")[0] != "torch":
             raise
         raise MissingExtraError(
-            "this needs PyTorch, which is not installed: pip install 'torch>=2.4,<2.14'; "
+            "this needs PyTorch, which is not installed: pip install 'torch>=2.6,<2.14'; "
             "without it, exported files run on ONNX Runtime, OpenVINO and NCNN"
         ) from error
 

@@ -231,6 +231,20 @@ def test_an_interrupted_change_of_the_shard_size_loses_nothing(root: Path) -> No
     assert PreparedDataset(root / ".prepared", "train").names == DrivingDataset(root, "train").names
 
 
+@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_progress_is_told_within_a_shard(root: Path, tmp_path: Path, workers: int) -> None:
+    told: list[tuple[int, int]] = []
+    prepare(
+        root, tmp_path / "out", canvas=CANVAS, shard_size=7, workers=workers, progress=lambda *done: told.append(done)
+    )
+    assert told == sorted(told)
+    assert told[-1] == (14, 14)
+    if not workers:
+        assert told == [(done, 14) for done in range(1, 15)]
+    prepare(root, tmp_path / "out", canvas=CANVAS, shard_size=7, progress=lambda *done: told.append(done))
+    assert told[-3:] == [(7, 14), (11, 14), (14, 14)]  # shards that are there
+
+
 def test_long_names(root: Path, tmp_path: Path) -> None:
     name = "straße" * 20
     (root / "images/val/val_0000.jpg").rename(root / f"images/val/{name}.jpg")

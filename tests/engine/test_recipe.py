@@ -54,6 +54,7 @@ def test_the_resolved_configuration_reads_back(tmp_path: Path) -> None:
         ("ema_ramp: -1", "ema_ramp must not be negative"),
         ("lr: .inf", "lr must be above 0 and not infinite"),
         ("multi_scale: [1, .inf]", "multi_scale"),
+        ("multi_scale: [1, 17]", r"multi_scale must be two factors up to 16, .*17"),
         ("task_weights: [1, .nan, 0]", "task_weights must not hold"),
         ("lane_tversky: [-1, 0]", "lane_tversky must not hold"),
         ("focal: [0.25, -2]", "focal must not hold"),

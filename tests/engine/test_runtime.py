@@ -281,7 +281,7 @@ def test_a_pytorch_that_cannot_tell_of_bf16_computes_in_fp32(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(platform, "machine", lambda: "x86_64")
-    monkeypatch.delattr(torch.cpu, "_is_avx512_bf16_supported")  # PyTorch 2.4
+    monkeypatch.delattr(torch.cpu, "_is_avx512_bf16_supported")
     assert runtime.pick_precision("auto", "cpu") == "32-true"
     with runtime.running_fabric("cpu", "bf16-mixed"):
         assert "--precision 32-true" in caplog.text

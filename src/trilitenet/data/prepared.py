@@ -21,11 +21,13 @@ import hashlib
 import io
 import json
 import logging
+import multiprocessing
 import os
 import re
 import shutil
 import tarfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -170,17 +172,13 @@ def prepare(
         for number, first in enumerate(range(0, len(dataset), shard_size))
     ]
     total = sum(map(len, datasets.values()))
-    done = 0
     with writing(out):
         _open_out(plan)
     with writing(out), contextlib.closing(Claim(out / PREPARED_FILE)):
         for part in out.glob(".*.part"):  # of a run that was killed
             part.unlink()
         _forget(plan, datasets)
-        for count in _run_jobs(plan, jobs, workers):
-            done += count
-            if progress:
-                progress(done, total)
+        _run_jobs(plan, jobs, workers, lambda done: progress(done, total) if progress else None)
         _write_state(plan, datasets)
     return {split: len(dataset) for split, dataset in datasets.items()}
 
@@ -447,25 +445,52 @@ def _mapped(path: Path, state: tuple[int, int, int]) -> NDArray[np.uint8]:
     return np.asarray(np.memmap(path, np.uint8, "r"))
 
 
-def _run_jobs(plan: _Plan, jobs: list[tuple[str, int, list[str]]], workers: int) -> Iterator[int]:
+def _run_jobs(plan: _Plan, jobs: list[tuple[str, int, list[str]]], workers: int, tell: Callable[[int], None]) -> None:
+    """Write all shards; tell how many images are done after each, or twice a second of several processes."""
     if workers <= 0 or len(jobs) < 2:
+        done = 0
+
+        def add(count: int) -> None:
+            nonlocal done
+            done += count
+            tell(done)
+
         for job in jobs:
-            yield _write_shard(plan, *job)
+            _write_shard(plan, *job, add)
         return
-    with ProcessPool(workers) as pool:
-        futures = [pool.submit(_write_shard, plan, *job) for job in jobs]
-        for future in concurrent.futures.as_completed(futures):
-            yield future.result()
+    counter = multiprocessing.get_context("spawn").Value("q")
+    with ProcessPool(workers, _begin, (counter,)) as pool:
+        waiting = {pool.submit(_write_shard, plan, *job, _count) for job in jobs}
+        while waiting:
+            finished, waiting = concurrent.futures.wait(waiting, 0.5, concurrent.futures.FIRST_COMPLETED)
+            for future in finished:
+                future.result()
+            tell(counter.value)
 
 
-def _write_shard(plan: _Plan, split: str, number: int, names: list[str]) -> int:
-    """Write one shard and its index, unless they are there for these images; return the number of images."""
+_counter: Synchronized[int]
+"""The images done by all processes together, in each of them."""
+
+
+def _begin(counter: Synchronized[int]) -> None:
+    global _counter
+    _counter = counter
+
+
+def _count(images: int) -> None:
+    with _counter.get_lock():
+        _counter.value += images
+
+
+def _write_shard(plan: _Plan, split: str, number: int, names: list[str], add: Callable[[int], None]) -> None:
+    """Write one shard and its index, unless they are there for these images; ``add`` gets how many are new."""
     path = plan.out / f"{split}-{number:06}.tar"
     index = plan.out / _index_name(path.name)
     dataset = DrivingDataset(plan.root, split, class_names=plan.class_names, names=names)
     made_from = _made_from(dataset)
     if _is_there(path, index, names, made_from):
-        return len(names)
+        add(len(names))
+        return
     entries: list[dict[str, Any]] = []
     with replacing(index) as index_part, replacing(path) as part:
         with tarfile.open(part, "w", format=tarfile.PAX_FORMAT) as tar:  # names of any length
@@ -476,10 +501,10 @@ def _write_shard(plan: _Plan, split: str, number: int, names: list[str]) -> int:
                     member.size = len(data)
                     tar.addfile(member, io.BytesIO(data))
                 entries.append(entry)
+                add(1)
         _locate(part, entries)
         entries[0]["made_from"] = made_from
         index_part.write_text("".join(json.dumps(entry) + "\n" for entry in entries), encoding="utf-8")
-    return len(names)
 
 
 def _is_there(path: Path, index: Path, names: list[str], made_from: str) -> bool:

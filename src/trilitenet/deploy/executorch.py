@@ -17,7 +17,7 @@ from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
 from trilitenet.deploy.graph import DeployGraph, Traceable
 from trilitenet.deploy.quantize import kept_nodes
 from trilitenet.deploy.quiet import quiet
-from trilitenet.errors import BackendError, import_extra
+from trilitenet.errors import BackendError, gist, import_extra
 
 __all__ = ["build_executorch"]
 
@@ -62,9 +62,7 @@ def build_executorch(
             )
             return bytes(lowered.to_executorch().buffer)
         except Exception as error:  # its passes raise what they like
-            raise BackendError(
-                f"ExecuTorch cannot lower the deploy graph ({' '.join(str(error).split())[:160]})"
-            ) from error
+            raise BackendError(f"ExecuTorch cannot lower the deploy graph ({gist(error)})") from error
 
 
 def _folded(program: Any) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
 from trilitenet.deploy.layouts import Unit
-from trilitenet.errors import OutputError, import_extra
+from trilitenet.errors import OutputError, gist, import_extra
 from trilitenet.processing.cores import processor
 
 __all__ = ["build_openvino", "save_openvino", "vector_unit", "with_own_biases"]
@@ -64,7 +64,7 @@ def save_openvino(model: Any, path: str | os.PathLike[str], card: ModelCard, inf
     try:
         openvino.save_model(model, Path(path), compress_to_fp16=info.precision == "fp16")
     except RuntimeError as error:  # "basic_ios::clear: iostream error" where the disk is full
-        raise OutputError(f"{path}: cannot be written ({' '.join(str(error).split())}); is there room?") from error
+        raise OutputError(f"{path}: cannot be written ({gist(error)}); is there room?") from error
 
 
 def vector_unit() -> Unit:

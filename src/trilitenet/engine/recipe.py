@@ -51,7 +51,7 @@ class TrainConfig:
         epochs: Passes over the data (Section IV-A: 200).
         batch_size: Images an optimiser step (Section IV-A: 16), over all processes.
         accumulate: Forward and backward passes an optimiser step; each takes batch_size / accumulate images.
-        multi_scale: Range of a random factor on the input size, a step; none if left out.
+        multi_scale: Range of a random factor of up to 16 on the input size, a step; none if left out.
         lr: Initial learning rate (Section IV-A: 0.001).
         betas: Of AdamW (Section IV-A: 0.937, 0.999).
         weight_decay: Of AdamW.
@@ -176,8 +176,8 @@ class TrainConfig:
             raise ConfigError(f"seed must be below 2**63, got {self.seed}")
         if self.batch_size % self.accumulate:
             raise ConfigError(f"batch_size {self.batch_size} is not a multiple of accumulate {self.accumulate}")
-        if self.multi_scale is not None and not 0 < self.multi_scale[0] <= self.multi_scale[1] < math.inf:
-            raise ConfigError(f"multi_scale must be two factors, the lower first, got {self.multi_scale}")
+        if self.multi_scale is not None and not 0 < self.multi_scale[0] <= self.multi_scale[1] <= 16:
+            raise ConfigError(f"multi_scale must be two factors up to 16, the lower first, got {self.multi_scale}")
         for name in ("task_weights", "box_gains", "drivable_tversky", "lane_tversky", "focal", "distillation"):
             if not all(0 <= value < math.inf for value in getattr(self, name)):
                 raise ConfigError(f"{name} must not hold negative or infinite numbers, got {getattr(self, name)}")

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import torch
 
-from trilitenet.errors import BackendError, ConfigError, TrainingError, TriLiteNetError, import_extra
+from trilitenet.errors import BackendError, ConfigError, TrainingError, TriLiteNetError, gist, import_extra
 from trilitenet.processing.cores import usable_cores
 from trilitenet.processing.memory import STEPS, keep_freed_memory
 
@@ -47,7 +47,7 @@ def pick_precision(precision: str, device: str) -> str:
 
 
 def _has_bf16() -> bool:
-    """Return whether an x86 has instructions for bf16; with PyTorch 2.4, which cannot tell, no."""
+    """Return whether an x86 has instructions for bf16; where PyTorch, by a private function, cannot tell, no."""
     return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", bool)())
 
 
@@ -162,7 +162,7 @@ def _connect(fabric: Any, devices: int, num_nodes: int) -> None:
     try:
         fabric.strategy.cluster_environment.validate_settings(num_devices=devices, num_nodes=num_nodes)
     except ValueError as error:
-        raise ConfigError(" ".join(str(error).split())) from error
+        raise ConfigError(gist(error)) from error
     try:
         fabric.launch()
     except RuntimeError as error:

@@ -36,6 +36,7 @@ from trilitenet.errors import (
     TrainingError,
     WeightsError,
     brief,
+    gist,
     write_file,
     writing,
 )
@@ -295,7 +296,7 @@ class Trainer:
             if not str(error).startswith(WORKER_LOST):
                 raise
             raise TrainingError(
-                f"a process that reads images was ended ({' '.join(str(error).split())}), mostly for want of memory; "
+                f"a process that reads images was ended ({gist(error)}), mostly for want of memory; "
                 f"lower --workers; {self._keep()}"
             ) from error
         self.fabric.barrier()

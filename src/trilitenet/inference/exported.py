@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, MAX_STRIDE, ArtefactInfo, ModelCard
-from trilitenet.errors import BackendError, ShapeError, TriLiteNetError, WeightsError
+from trilitenet.errors import BackendError, ShapeError, TriLiteNetError, WeightsError, gist
 from trilitenet.inference.backend import check_batch
 from trilitenet.structures import RawOutputs
 
@@ -139,10 +139,7 @@ class ArtefactBackend(abc.ABC):
         except TriLiteNetError:
             raise
         except Exception as error:  # what runtimes raise shares no base class
-            words = " ".join(str(error).split())
-            if len(words) > 200:  # OpenVINO begins with its files and ends with the cause
-                words = f"{words[:80]} ... {words[-115:]}"
-            raise BackendError(f"the runtime failed ({words})") from error
+            raise BackendError(f"the runtime failed ({gist(error)})") from error
 
         def mask(name: str) -> NDArray[np.uint8] | None:
             if name not in card.tasks:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.errors import BackendError, WeightsError, import_extra
+from trilitenet.errors import BackendError, WeightsError, gist, import_extra
 from trilitenet.inference.backend import ParallelSessions, held
 from trilitenet.inference.exported import ArtefactBackend, check_graph, prepare_input, read_metadata
 
@@ -65,9 +65,7 @@ class OnnxBackend(ParallelSessions, ArtefactBackend):
         try:
             return self._runtime.InferenceSession(str(self._path), options, providers=self._providers)
         except Exception as error:  # its exceptions share no base class of their own
-            reason = " ".join(str(error).split())[:160]
-            if "INVALID_PROTOBUF" in reason:
-                reason = "cut off or damaged; export it again"
+            reason = "cut off or damaged; export it again" if "INVALID_PROTOBUF" in str(error) else gist(error)
             raise WeightsError(f"{self._path}: not a usable ONNX model ({reason})") from error
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY
-from trilitenet.errors import BackendError, ConfigError, WeightsError, import_extra
+from trilitenet.errors import BackendError, ConfigError, WeightsError, gist, import_extra
 from trilitenet.inference.backend import MOST_PARALLEL, check_process, held, replaced
 from trilitenet.inference.exported import ArtefactBackend, check_graph, prepare_input, read_metadata
 from trilitenet.processing.cores import usable_cores
@@ -76,12 +76,12 @@ class OpenVINOBackend(ArtefactBackend):
         try:
             model = core.read_model(path)
         except RuntimeError as error:
-            reason = " ".join(str(error).split())
-            if "ParseFromIstream" in reason or "binary protobuf" in reason:  # older versions say the latter
+            said, reason = str(error), gist(error)
+            if "ParseFromIstream" in said or "binary protobuf" in said:  # older versions say the latter
                 reason = "cut off or damaged; export it again"
-            elif "is_valid_weights_range" in reason or "Incorrect weights" in reason:
+            elif "is_valid_weights_range" in said or "Incorrect weights" in said:
                 reason = f"{weights.name} is cut off, or of another file; export it again"
-            raise WeightsError(f"{path}: not a usable OpenVINO or ONNX model ({reason[:160]})") from error
+            raise WeightsError(f"{path}: not a usable OpenVINO or ONNX model ({reason})") from error
         self._card, self.info = read_metadata(_metadata(model), str(path))
         shapes = [
             [] if each.rank.is_dynamic else [None if side.is_dynamic else side.get_length() for side in each]
@@ -123,7 +123,7 @@ class OpenVINOBackend(ArtefactBackend):
             return self._core.compile_model(self._model, self._device, options)
         except RuntimeError as error:
             raise BackendError(
-                f"{self._path}: OpenVINO cannot compile it for {self._device} ({' '.join(str(error).split())[:160]})"
+                f"{self._path}: OpenVINO cannot compile it for {self._device} ({gist(error)})"
             ) from error
 
     def __reduce__(self) -> tuple[Any, ...]:
