@@ -256,7 +256,7 @@ def test_what_is_asked_of_a_model_reaches_it(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("trilitenet.commands.benchmark.load", load)
     backends = ("torch", "openvino")
     result = benchmark(backend=backends, device="cuda:1", streams=2, threads=3, rounds=1, warmup=0, size=(32, 64))
-    both = {"device": "cuda:1", "streams": 2, "threads": 3}
+    both = {"network": None, "device": "cuda:1", "streams": 2, "threads": 3}
     assert asked == [("tiny", {"backend": backend, **both}) for backend in backends]
     assert (result.machine["threads"], result.machine["streams"]) == ("3", "2")
 

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 import trilitenet
 from trilitenet.commands.energy import energy_meters
-from trilitenet.commands.load import check_parallel, load
+from trilitenet.commands.load import check_parallel, load, own_builder
 from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, one_for_several, optional_path
-from trilitenet.config import VARIANTS, check_size
+from trilitenet.config import TASKS, VARIANTS, check_size
 from trilitenet.engine.provenance import peak_memory
 from trilitenet.errors import ConfigError, import_extra, write_file
 from trilitenet.inference.predictor import Predictor
@@ -75,7 +75,7 @@ class Cost:
     """What a variant costs (the counterpart of the paper's cost table).
 
     Attributes:
-        variant: Its name.
+        variant: Its name, and that of the function that built it if it is one's own.
         parameters: Number of parameters.
         multiply_adds: Of convolutions and matrix products for one image of ``size``.
         size: (height, width) in pixels.
@@ -148,6 +148,7 @@ def benchmark(
     warmup: int = 5,
     size: tuple[int, int] = (384, 640),
     source: tuple[int, int] = (720, 1280),
+    network: str | None = None,
     device: str = "auto",
     streams: int = 1,
     threads: int | None = None,
@@ -161,11 +162,14 @@ def benchmark(
         backend: Runtimes to try each model on; those that do not run a file are an error.
         batch: Images a call.
         stage: network (letterboxed pixels to raw outputs) or frame (image to boxes and masks of its own size).
-        table: latency, or cost: parameters and multiply-adds of the three variants, nothing timed.
+        table: latency, or cost: parameters and multiply-adds of the three variants (with --network of one's own beside
+            them), nothing timed.
         rounds: Timed calls an entry; every round calls each entry once.
         warmup: Calls before.
         size: Height and width of the network's input, where a model takes any; --stage frame takes the longer side.
         source: Height and width of the image for --stage frame.
+        network: The function that built the network of those weight files that are of one of your own:
+            FILE.py:FUNCTION or MODULE:FUNCTION.
         device: auto, cpu, cuda.
         streams: Images OpenVINO computes at once; use with --batch of as many or more.
         threads: Threads of every runtime; their own choice if left out.
@@ -204,10 +208,10 @@ def benchmark(
     with ExitStack() as stack:
         calls: list[_Call] = []
         if table == "cost":
-            result = Benchmark((), _costs(size), machine, 0, None)
+            result = Benchmark((), _costs(size, network), machine, 0, None)
         else:
             for name, one in itertools.product([os.fspath(model) for model in models or ("tiny",)], backend):
-                entry = _Entry(name, one, device, streams, threads)
+                entry = _Entry(name, one, device, streams, threads, own_builder(name, network))
                 stack.enter_context(entry.predictor)
                 calls += [_Call(entry, count, stage, size, source) for count in batch]
             timings, memory = _measure(calls, rounds, warmup), peak_memory()
@@ -223,10 +227,14 @@ def benchmark(
 class _Entry:
     """A model on a runtime, and how long it took to load."""
 
-    def __init__(self, model: str, backend: str, device: str, streams: int, threads: int | None) -> None:
+    def __init__(
+        self, model: str, backend: str, device: str, streams: int, threads: int | None, network: str | None
+    ) -> None:
         self.model = model
         started = time.perf_counter()
-        self.predictor: Predictor = load(model, backend=backend, device=device, streams=streams, threads=threads)
+        self.predictor: Predictor = load(
+            model, network=network, backend=backend, device=device, streams=streams, threads=threads
+        )
         self.loading = time.perf_counter() - started
         self.first: float | None = None
 
@@ -314,15 +322,16 @@ def _machine(threads: int | None, streams: int) -> dict[str, str]:
     }
 
 
-def _costs(size: tuple[int, int]) -> tuple[Cost, ...]:
+def _costs(size: tuple[int, int], network: str | None) -> tuple[Cost, ...]:
+    from trilitenet.models.builders import build_by
     from trilitenet.models.cost import count_multiply_adds, count_parameters
-    from trilitenet.models.trilitenet import build_network
 
-    networks = {name: build_network(name) for name in VARIANTS}
-    return tuple(
-        Cost(name, count_parameters(network), count_multiply_adds(network, size), size)
-        for name, network in networks.items()
-    )
+    costs = []
+    for variant, builder in itertools.product(VARIANTS, (None,) if network is None else (None, network)):
+        built = build_by(builder, variant, 1, TASKS)
+        name = variant if builder is None else f"{variant}, {builder}"
+        costs.append(Cost(name, count_parameters(built), count_multiply_adds(built, size), size))
+    return tuple(costs)
 
 
 def _plot(calls: Sequence[_Call], path: Path) -> None:

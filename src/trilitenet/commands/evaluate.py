@@ -46,6 +46,7 @@ def evaluate(
     by: Sequence[str] = CONDITIONS,
     paper_batch: int = 16,
     batch_size: int = 1,
+    network: str | None = None,
     device: str = "auto",
     backend: str = "auto",
     confidence: float | None = None,
@@ -73,6 +74,8 @@ def evaluate(
         by: Attributes to make tables by.
         paper_batch: Images a batch of the published averages.
         batch_size: At most so many images go through the network at once.
+        network: The function that built a weight file's network, where it is one of your own: FILE.py:FUNCTION or
+            MODULE:FUNCTION.
         device: auto, cpu, cuda, cuda:1, mps.
         backend: auto (what the file is for) or the name of a runtime.
         confidence: State precision, recall and F1 above this confidence; the model's own if left out.
@@ -99,6 +102,7 @@ def evaluate(
     check_output(output, overwrite)
     predictor = load(
         model,
+        network=network,
         device=device,
         backend=backend,
         confidence=confidence,

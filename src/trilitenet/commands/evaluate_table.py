@@ -14,6 +14,7 @@ from typing import Final, Literal
 
 from trilitenet.commands.evaluate import evaluate, hash_dataset, hash_model, known_report
 from trilitenet.commands.export import PRECISIONS, check_drop, drop_frames, export, find_pictures
+from trilitenet.commands.load import own_builder
 from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, one_for_several
 from trilitenet.commands.tables import PAPER_COLUMNS, markdown_row
 from trilitenet.config import ARTEFACT_SUFFIXES, VARIANTS, Precision
@@ -115,6 +116,7 @@ def evaluate_table(
     calibration_frames: int = 500,
     max_drop: float | None = None,
     limit: int | None = None,
+    network: str | None = None,
     overwrite: bool = False,
 ) -> PrecisionTable:
     """Export models in several precisions, measure each by both protocols, and print the paper's table of precisions.
@@ -135,6 +137,8 @@ def evaluate_table(
         calibration_frames: At most so many of them.
         max_drop: INT8 may lose at most so many points on the val split; layers fall back until it does.
         limit: Measure on the first so many images alone.
+        network: The function that built the network of those weight files that are of one of your own, with other
+            widths or numbers of blocks: FILE.py:FUNCTION or MODULE:FUNCTION.
         overwrite: Make everything again.
 
     Returns:
@@ -194,6 +198,7 @@ def evaluate_table(
                         max_drop=max_drop if precision == "int8" else None,
                         masks="probability",  # the protocols decide by thresholds of their own
                         frames=data,
+                        network=own_builder(model, network),
                         overwrite=True,
                     )
                 sys.stderr.write(f"{stage}: measuring\n")

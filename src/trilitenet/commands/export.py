@@ -144,6 +144,7 @@ def export(
     bgr: bool = False,
     layout: str = "auto",
     frames: StrPath | None = None,
+    network: str | None = None,
     overwrite: bool = False,
 ) -> Exported:
     """Export a model to another runtime; preprocessing, anchors, classes and thresholds travel inside.
@@ -171,6 +172,8 @@ def export(
         bgr: Take BGR pixels (`trilitenet.load` converts by itself).
         layout: auto, or a memory layout by name (docs/speed.md); all compute the same.
         frames: Pictures for the comparison; by default those of --calibration, else synthetic scenes.
+        network: The function that built the network, where it is one of your own with other widths or numbers of
+            blocks: FILE.py:FUNCTION or MODULE:FUNCTION. Other layers cannot be exported.
         overwrite: Replace existing files of an artefact.
 
     Returns:
@@ -189,8 +192,8 @@ def export(
     )
     path = _destination(model, format, output)
     _check_files(path, format, overwrite)
-    network = load_network(model).eval()
-    if nms and "detection" not in network.tasks:
+    trained = load_network(model, network)
+    if nms and "detection" not in trained.tasks:
         raise ConfigError(f"{model} has no detection task, so there are no boxes to suppress; leave --nms out")
     if format == "triton":
         with scratch_folder() as folder:
@@ -212,11 +215,12 @@ def export(
                     bgr=bgr,
                     layout=layout,
                     frames=frames,
+                    network=network,
                 )
             except BackendError as error:  # it names the graph, which goes with its folder
                 raise BackendError(str(error).replace(str(graph_path), str(path))) from error
             with uninterrupted():  # the former model has gone before the new one comes
-                write_triton_repository(exported.path, path.parent, network.card, name=path.name, overwrite=overwrite)
+                write_triton_repository(exported.path, path.parent, trained.card, name=path.name, overwrite=overwrite)
         serve = f"Serve it with: tritonserver --model-repository {path.parent.resolve()}"
         return dataclasses.replace(exported, path=path, notes=(*exported.notes, serve))
 
@@ -234,34 +238,34 @@ def export(
     )
     runtime = "planar" if portable else _RUNTIMES.get(format, format)
     graph = DeployGraph(
-        network,
-        pick_layout(layout, network.variant, runtime, unit=vector_unit()),
+        trained,
+        pick_layout(layout, trained.variant, runtime, unit=vector_unit()),
         masks=masks,
         mask_scale=mask_scale,
         bgr=bgr,
     )
-    checks = _canvases(frames or calibration, parsed or network.card.input_size, 8)
+    checks = _canvases(frames or calibration, parsed or trained.card.input_size, 8)
     if format == "torch":
-        traceable = Traceable(graph, network.card, info)
+        traceable = Traceable(graph, trained.card, info)
         with torch.no_grad():
             program = torch.export.export(traceable, (traceable.image,), dynamic_shapes=traceable.dynamic)
-        return _keep(network, program, info, path, checks)
+        return _keep(trained, program, info, path, checks)
     if format == "ncnn":
-        return _keep(network, build_ncnn(graph, network.card, info), info, path, checks)
+        return _keep(trained, build_ncnn(graph, trained.card, info), info, path, checks)
     if format == "executorch":
-        build = functools.partial(build_executorch, graph, network.card, info)
+        build = functools.partial(build_executorch, graph, trained.card, info)
         if calibration is None or precision != "int8":
-            return _keep(network, build(), info, path, checks)
-        return _export_int8(network, build, info, path, checks, calibration, calibration_frames, max_drop)
-    thresholds = network.card.thresholds if nms else None
-    proto = build_onnx(graph, network.card, info, nms=thresholds, half=format == "onnx" and precision == "fp16")
+            return _keep(trained, build(), info, path, checks)
+        return _export_int8(trained, build, info, path, checks, calibration, calibration_frames, max_drop)
+    thresholds = trained.card.thresholds if nms else None
+    proto = build_onnx(graph, trained.card, info, nms=thresholds, half=format == "onnx" and precision == "fp16")
     if format == "tensorrt":
-        return _export_tensorrt(network, proto, info, path, checks)
+        return _export_tensorrt(trained, proto, info, path, checks)
     built: Any = build_openvino(proto) if format == "openvino" else proto
     if calibration is None or precision != "int8":
-        return _keep(network, built, info, path, checks)
+        return _keep(trained, built, info, path, checks)
     quantize = functools.partial(quantize_openvino if format == "openvino" else quantize_onnx, built)
-    return _export_int8(network, quantize, info, path, checks, calibration, calibration_frames, max_drop)
+    return _export_int8(trained, quantize, info, path, checks, calibration, calibration_frames, max_drop)
 
 
 def _check_options(

@@ -6,7 +6,7 @@ import dataclasses
 import importlib.util
 import os
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from trilitenet.config import VARIANTS
 from trilitenet.errors import ConfigError, did_you_mean, needing_torch
@@ -14,7 +14,10 @@ from trilitenet.inference.backend import Backend
 from trilitenet.inference.exported import is_int8_onnx
 from trilitenet.inference.predictor import Predictor
 
-__all__ = ["BACKENDS", "check_parallel", "load", "open_backend"]
+if TYPE_CHECKING:
+    from trilitenet.models.builders import Builder
+
+__all__ = ["BACKENDS", "check_parallel", "load", "open_backend", "own_builder"]
 
 BACKENDS = ("auto", "torch", "onnxruntime", "openvino", "ncnn", "executorch", "tensorrt")
 """What ``backend`` may be."""
@@ -33,6 +36,7 @@ _MADE: Final = {"onnxruntime": "onnx"}
 def load(
     model: str | os.PathLike[str] = "tiny",
     *,
+    network: Builder | None = None,
     device: str = "auto",
     backend: str = "auto",
     confidence: float | None = None,
@@ -49,6 +53,8 @@ def load(
     Args:
         model: Name of shipped weights, a file of weights, or an exported artefact (.onnx, .xml, .param or the folder
             it is in, .pte, .engine, .pt2).
+        network: The function that builds the network of a file of weights, or its name, where that is not
+            `build_network`; see `load_network`.
         device: auto (the best there is), cpu, cuda, cuda:1, mps.
         backend: auto (the fastest present that runs the file), torch, onnxruntime, openvino, ncnn, executorch or
             tensorrt. A file of weights runs on PyTorch: on CUDA, auto is its deploy graph in fp16 under CUDA graphs,
@@ -77,7 +83,7 @@ def load(
         raise ConfigError(f"unknown backend {backend!r}{did_you_mean(backend, BACKENDS)}")
     check_parallel(streams=streams, threads=threads)
     with needing_torch():
-        runtime = open_backend(model, device, backend, streams, threads)
+        runtime = open_backend(model, device, backend, streams, threads, network)
     try:
         if long_side is not None and runtime.canvas is not None and long_side != max(runtime.canvas):
             height, width = runtime.canvas
@@ -94,6 +100,24 @@ def load(
         raise ConfigError(f"{model}: {error}") from error
 
 
+def own_builder(model: str | os.PathLike[str], network: str | None) -> str | None:
+    """Return the function that built a model's network if the file is of weights of a network of one's own, else None.
+
+    Args:
+        model: One of several models, of which others are of other networks, or exported.
+        network: The function's name as it was given.
+
+    Raises:
+        WeightsError: If the file is broken.
+    """
+    path = Path(os.fspath(model))
+    if network is None or path.suffix.lower() in {*_RUNS, ".pt2"} or path.is_dir():
+        return None
+    from trilitenet.models.weights import read_builder
+
+    return network if read_builder(model) is not None else None
+
+
 def check_parallel(**counts: int | None) -> None:
     """Refuse a number of streams or threads below 1, by its name.
 
@@ -106,7 +130,12 @@ def check_parallel(**counts: int | None) -> None:
 
 
 def open_backend(
-    model: str | os.PathLike[str], device: str, backend: str, streams: int = 1, threads: int | None = None
+    model: str | os.PathLike[str],
+    device: str,
+    backend: str,
+    streams: int = 1,
+    threads: int | None = None,
+    network: Builder | None = None,
 ) -> Backend:
     """Open a file on the runtime asked for, or on the fastest one here that runs it."""
     path = Path(os.fspath(model))
@@ -114,6 +143,8 @@ def open_backend(
     if str(model) not in VARIANTS and path.is_dir() and any(path.glob("*.param")):
         suffix = ".param"
     runs = _RUNS.get(suffix, ("torch",))
+    if network is not None and (suffix in _RUNS or suffix == ".pt2"):
+        raise ConfigError(f"{model}: is an exported file, which holds its network; leave --network out")
     if backend == "auto":
         # OpenVINO was the faster of the two on every processor measured (docs/speed.md); it has no CUDA.
         usable = [name for name in runs if importlib.util.find_spec(name) is not None]
@@ -152,16 +183,17 @@ def open_backend(
         from trilitenet.inference.exported_torch_backend import ExportedTorchBackend
 
         return ExportedTorchBackend(model, device)
-    return _open_torch(model, device, fastest=fastest)
+    return _open_torch(model, device, network, fastest=fastest)
 
 
-def _open_torch(model: str | os.PathLike[str], device: str, *, fastest: bool) -> Backend:
+def _open_torch(model: str | os.PathLike[str], device: str, builder: Builder | None, *, fastest: bool) -> Backend:
     from trilitenet.inference.torch_backend import TorchBackend, check_threads, pick_device
+    from trilitenet.models.trilitenet import foreign_layers
     from trilitenet.models.weights import load_network
 
     check_threads()
-    network = load_network(model)
-    if fastest and pick_device(device).type == "cuda":
+    network = load_network(model, builder)
+    if fastest and pick_device(device).type == "cuda" and not foreign_layers(network):
         import torch
 
         from trilitenet.deploy.graph import DeployGraph

@@ -146,6 +146,7 @@ def predict(
     *sources: NameOrPath,
     output: StrPath = Path("predictions"),
     model: NameOrPath = "tiny",
+    network: str | None = None,
     device: str = "auto",
     backend: str = "auto",
     confidence: float | None = None,
@@ -178,6 +179,8 @@ def predict(
             camera's number (0), - for a video on standard input.
         output: Folder for the results.
         model: Name of shipped weights, a weight file, or an exported artefact of any runtime.
+        network: The function that built a weight file's network, where it is one of your own: FILE.py:FUNCTION or
+            MODULE:FUNCTION.
         device: auto (the best there is), cpu, cuda, cuda:1, mps.
         backend: auto (what the file is for), or a runtime by name.
         confidence: Keep boxes whose confidence is above this, in [0, 1]; the model's own if left out.
@@ -229,6 +232,7 @@ def predict(
     )
     with load(
         model,
+        network=network,
         device=device,
         backend=backend,
         confidence=confidence,

@@ -56,8 +56,9 @@ from trilitenet.losses.detection import DetectionLoss
 from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.losses.multitask import MultiTaskLoss
 from trilitenet.losses.segmentation import SegmentationLoss
-from trilitenet.models.trilitenet import TriLiteNet, build_network
-from trilitenet.models.weights import load_network
+from trilitenet.models.builders import build_by
+from trilitenet.models.trilitenet import TriLiteNet
+from trilitenet.models.weights import load_network, read_builder
 
 __all__ = ["build_loss", "train", "training_data", "validation_figures"]
 
@@ -264,7 +265,7 @@ def _transform(config: TrainConfig, dataset: SampleSource, display: _Display) ->
 def _network(config: TrainConfig, dataset: SampleSource, display: _Display, *, resume: bool) -> TriLiteNet:
     """Build the network: anchors, initial weights, frozen parts."""
     anchors = config.anchors
-    initial = load_network(config.init) if config.init is not None and not resume else None
+    initial = _weights(config, config.init) if config.init is not None and not resume else None
     if config.auto_anchor and anchors is None and "detection" in config.tasks and not resume:
         swapped = config.swapped_anchors
         sizes = box_sizes(dataset, config.input_size, seed=config.seed, swapped=swapped, progress=display.anchors)
@@ -274,7 +275,8 @@ def _network(config: TrainConfig, dataset: SampleSource, display: _Display, *, r
         fit = fit_anchors(sizes, before, enough=enough, seed=config.seed)
         display.line(fit.summary())
         anchors = fit.anchors
-    network = build_network(
+    network = build_by(
+        config.network,
         config.variant,
         len(dataset.class_names),
         config.tasks,
@@ -292,9 +294,16 @@ def _network(config: TrainConfig, dataset: SampleSource, display: _Display, *, r
     return network
 
 
+def _weights(config: TrainConfig, path: str) -> TriLiteNet:
+    """Load weights of an ordinary network, or of one that the run's own function builds."""
+    return load_network(path, config.network if read_builder(path) is not None else None)
+
+
 def _card(config: TrainConfig, network: TriLiteNet, dataset: SampleSource, recipe: Path | None) -> ModelCard:
     roots = [config.data, *config.extra_data]
     provenance = {"recipe": recipe.name if recipe is not None else "defaults", "seed": str(config.seed)}
+    if config.network is not None:
+        provenance["network"] = config.network
     if config.init is not None:
         provenance["initial weights"] = Path(config.init).name
     if config.teacher is not None:
@@ -329,7 +338,7 @@ def build_loss(config: TrainConfig, network: TriLiteNet) -> MultiTaskLoss:
 def _teacher(config: TrainConfig, network: TriLiteNet) -> tuple[TriLiteNet, DistillationLoss] | None:
     if config.teacher is None or Path(config.teacher).is_dir():
         return None
-    teacher = load_network(config.teacher)
+    teacher = _weights(config, config.teacher)
     if not set(teacher.tasks) & set(network.tasks):
         raise ConfigError(f"{config.teacher}: the teacher has none of the tasks {', '.join(network.tasks)}")
     told, wanted = teacher.card.class_names, network.card.class_names

@@ -136,7 +136,7 @@ def train_table(
             finished, first = result.finished, result.first
         if not finished:
             break
-        network = load_network(weights)
+        network = load_network(weights, configs[name].network)
         figures = _measure(weights, network, configs[name]) if first else {}
         rows.append(
             TableRow(name, figures, count_parameters(network), count_multiply_adds(network, network.card.input_size))
@@ -152,6 +152,7 @@ def _measure(weights: Path, network: TriLiteNet, config: TrainConfig) -> dict[st
     folder = weights.parent / _REPORT
     report = known_report(folder, str(weights), lambda: hash_dataset(dataset)) or evaluate(
         str(weights),
+        network=config.network,
         data=Path(config.data),
         split=config.val_split,
         protocol="paper",

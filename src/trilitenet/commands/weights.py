@@ -73,6 +73,7 @@ def finish(
     input_size: tuple[int, int] | None = None,
     iou: float | None = None,
     batch_size: int = 8,
+    network: str | None = None,
     full: bool = False,
     overwrite: bool = False,
 ) -> ModelCard:
@@ -90,6 +91,8 @@ def finish(
         input_size: Height and width the weights are meant for; those of the training run if left out.
         iou: Overlap at which non-maximum suppression drops a box; the card's if left out.
         batch_size: At most so many images go through the network at once.
+        network: The function that built a weight file's network, where it is one of your own: FILE.py:FUNCTION or
+            MODULE:FUNCTION.
         full: Store 32-bit floats instead of fp16.
         overwrite: Replace an existing destination.
 
@@ -109,8 +112,8 @@ def finish(
     if input_size is not None:
         check_size(input_size, "--input-size")
     check_counts(0, batch_size=batch_size)
-    network = load_network(source)
-    described = _describe(network.card, [parse(CardText, read_yaml(path), str(path)) for path in card])
+    trained = load_network(source, network)
+    described = _describe(trained.card, [parse(CardText, read_yaml(path), str(path)) for path in card])
     if input_size is not None:
         described = dataclasses.replace(described, input_size=input_size)
     if iou is not None:
@@ -119,8 +122,8 @@ def finish(
     with scratch_folder() as folder:
         draft = folder / "draft.safetensors"
         # Measured as stored: what the user loads is what the figures are of.
-        save_network(network, draft, dataclasses.replace(described, metrics={}), half=not full)
-        with load(draft) as predictor, show_progress("thresholds") as shown:
+        save_network(trained, draft, dataclasses.replace(described, metrics={}), half=not full)
+        with load(draft, network=network) as predictor, show_progress("thresholds") as shown:
             best = best_thresholds(predictor, dataset, batch_size=batch_size, progress=shown)
             predictor.thresholds = best.thresholds
             shown.name("figures")
@@ -135,7 +138,7 @@ def finish(
             )
         figures = {f"{split} {name}": round(figure.value, 4) for name, figure in report.figures.items()}
         finished = dataclasses.replace(described, thresholds=best.thresholds, metrics=figures)
-        save_network(network, destination, finished, half=not full)
+        save_network(trained, destination, finished, half=not full)
     sys.stdout.write(f"{report.summary()}\nwritten to {destination}\n")
     return finished
 

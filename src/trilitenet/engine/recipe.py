@@ -33,6 +33,8 @@ class TrainConfig:
         input_size: (height, width) in pixels, multiples of 32 (Section IV-A: 640x384).
         augmentation: Strengths of the random transforms.
         variant: tiny, small or base (Section III-B).
+        network: A function of one's own that builds the network, called as `build_network` is: FILE.py:FUNCTION or
+            MODULE:FUNCTION.
         tasks: Of detection, drivable and lane.
         pcaa: With partial class activation attention.
         litepan: With LitePAN's two paths.
@@ -99,6 +101,7 @@ class TrainConfig:
     input_size: tuple[int, int] = (384, 640)
     augmentation: Augmentation = Augmentation()  # noqa: RUF009 - frozen, so shared safely
     variant: str = "tiny"
+    network: str | None = None
     tasks: tuple[Task, ...] = TASKS
     pcaa: bool = True
     litepan: bool = True

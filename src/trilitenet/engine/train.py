@@ -60,6 +60,7 @@ FIGURES: Final = {"detection": "detection/ap50", "drivable": "drivable/miou", "l
 
 SAME_ON_RESUME: Final = (
     "variant",
+    "network",
     "tasks",
     "pcaa",
     "litepan",

@@ -66,10 +66,12 @@ class TriLiteNet(nn.Module):
         blocks: Which of ``"pcaa"``, ``"litepan"`` and ``"spp"`` it has.
         anchors: (3, 3, 2) float32 buffer: width, height in input pixels, a level and anchor.
         card: What is known of its weights.
+        built_by: Name of the function that built it; None for `build_network`.
     """
 
     anchors: Tensor
     card: ModelCard
+    built_by: str | None = None
 
     def __init__(
         self,

@@ -32,11 +32,13 @@ from trilitenet.config import (
     shipped_weights,
 )
 from trilitenet.errors import ConfigError, OutputError, WeightsError, few, replacing
+from trilitenet.models.builders import Builder, build_by, name_of
 from trilitenet.models.trilitenet import TriLiteNet, build_network, foreign_layers
 
 __all__ = [
     "import_published",
     "load_network",
+    "read_builder",
     "read_card",
     "resolve_weights",
     "save_network",
@@ -81,6 +83,9 @@ _RENAMES: Final = (
 _FOREIGN_KEY: Final = "trilitenet.foreign_layers"
 """Key, in a file's metadata, of the layers that `build_network` does not make; absent where there are none."""
 
+_NETWORK_KEY: Final = "trilitenet.network"
+"""Key, in a file's metadata, of the name of the function that built the network; absent for `build_network`."""
+
 _TRAINING_STATE: Final = frozenset({"schema", "config", "network", "optimiser"})
 """Keys that tell the training state of `trilitenet train` from other pickles."""
 
@@ -107,7 +112,7 @@ def resolve_weights(model: str | os.PathLike[str]) -> Path:
 def save_network(network: TriLiteNet, path: str | os.PathLike[str], card: ModelCard, *, half: bool = False) -> None:
     """Write weights and card to one safetensors file, atomically.
 
-    A network with layers that `build_network` does not make is written too, but `load_network` refuses the file.
+    Of a network with layers that `build_network` does not make, `load_network` must be told the function that makes it.
 
     Args:
         network: What to save; its anchors replace the card's.
@@ -144,6 +149,8 @@ def save_network(network: TriLiteNet, path: str | os.PathLike[str], card: ModelC
     metadata = {CARD_KEY: card.to_json()}  # a second entry would come before or after it by chance
     if foreign := foreign_layers(network):
         metadata[_FOREIGN_KEY] = ", ".join(foreign)
+    if network.built_by is not None:
+        metadata[_NETWORK_KEY] = network.built_by
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as part:
@@ -159,15 +166,27 @@ def read_card(path: str | os.PathLike[str]) -> ModelCard:
         WeightsError: If the file is missing, broken, foreign or of a newer layout.
     """
     path = resolve_weights(path)
-    card, _ = _open(path, tensors=False)
+    card, _, _ = _open(path, tensors=False)
     return card
 
 
-def load_network(path: str | os.PathLike[str]) -> TriLiteNet:
+def read_builder(path: str | os.PathLike[str]) -> str | None:
+    """Read from a safetensors file which function built its network; None for `build_network`.
+
+    Raises:
+        WeightsError: If the file is missing, broken, foreign or of a newer layout.
+    """
+    _, metadata, _ = _open(resolve_weights(path), tensors=False)
+    return metadata.get(_NETWORK_KEY)
+
+
+def load_network(path: str | os.PathLike[str], network: Builder | None = None) -> TriLiteNet:
     """Load a network from its safetensors file, in evaluation mode on the CPU.
 
     Args:
         path: A file, or the name of shipped weights.
+        network: The function that builds the network, or its name (``"FILE.py:FUNCTION"`` or ``"MODULE:FUNCTION"``),
+            where that is not `build_network`; see `trilitenet.models.builders`. It is called with what the card tells.
 
     Returns:
         The network, with its ``card``.
@@ -175,15 +194,33 @@ def load_network(path: str | os.PathLike[str]) -> TriLiteNet:
     Raises:
         WeightsError: If the file is missing, broken, foreign, of a newer layout or of a network with other layers, or
             if any tensor is missing, surplus, misshapen or not finite.
+        ConfigError: If the function is missing, raises, or builds something else.
     """
     path = resolve_weights(path)
-    card, tensors = _open(path, tensors=True)
+    card, metadata, tensors = _open(path, tensors=True)
+    layers = metadata.get(_FOREIGN_KEY, "")
+    if network is None and _NETWORK_KEY in metadata:
+        name = metadata[_NETWORK_KEY]
+        raise WeightsError(
+            f"{path}: is of a network that {name} builds; that code is run only where it is named: network={name!r} "
+            f"(--network {name})"
+        )
+    if network is None and layers:
+        raise WeightsError(
+            f"{path}: is of a network with layers that build_network does not make: {layers}; name the function that "
+            "makes them: network='FILE.py:FUNCTION' (docs/network.md)"
+        )
     blocks = {name: name in card.blocks for name in ("pcaa", "litepan", "spp")}
     with torch.random.fork_rng(devices=()):  # the random weights that are replaced take nothing from a seeded run
-        network = build_network(card.variant, card.classes, card.tasks, anchors=card.anchors, **blocks)
-    _load_strictly(network, tensors, str(path))
-    network.card = card
-    return network.eval()
+        built = build_by(network, card.variant, card.classes, card.tasks, anchors=card.anchors, **blocks)
+    if network is not None and (found := ", ".join(foreign_layers(built))) != layers:
+        ordinary = "no layers but those of build_network"
+        raise WeightsError(
+            f"{path}: is of a network with {layers or ordinary}, {name_of(network)} builds one with {found or ordinary}"
+        )
+    _load_strictly(built, tensors, str(path))
+    built.card = card
+    return built.eval()
 
 
 def import_published(
@@ -242,7 +279,7 @@ def rename_published(key: str) -> str:
     return key
 
 
-def _open(path: Path, *, tensors: bool) -> tuple[ModelCard, dict[str, Tensor]]:
+def _open(path: Path, *, tensors: bool) -> tuple[ModelCard, dict[str, str], dict[str, Tensor]]:
     if path.stat().st_size == 0:
         raise WeightsError(f"{path}: is empty; copy or download it again")
     try:
@@ -252,13 +289,8 @@ def _open(path: Path, *, tensors: bool) -> tuple[ModelCard, dict[str, Tensor]]:
                 raise WeightsError(f"{path}: is safetensors, but has no trilitenet card; it is another model's")
             card = ModelCard.from_json(metadata[CARD_KEY], str(path))
             get_variant(card.variant)
-            if tensors and _FOREIGN_KEY in metadata:
-                raise WeightsError(
-                    f"{path}: is of a network with layers that build_network does not make: {metadata[_FOREIGN_KEY]}; "
-                    "build that network and give it the tensors of safetensors.torch.load_file"
-                )
             keys = list(file.keys()) if tensors else []
-            return card, {key: file.get_tensor(key) for key in keys}
+            return card, metadata, {key: file.get_tensor(key) for key in keys}
     except SafetensorError as error:
         if path.name.lower().endswith(tuple(ARTEFACT_SUFFIXES.values())):
             raise WeightsError(

@@ -159,6 +159,18 @@ def test_the_model_needs_no_option_name(started: list[Any]) -> None:
     assert (_settings(server).memory, _settings(server).max_connections) == (2_000_000_000, 7)
 
 
+def test_a_network_of_ones_own_is_handed_on(started: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[dict[str, Any]] = []
+
+    def load(model: str, **options: Any) -> Predictor:
+        told.append(options)
+        return Predictor(FakeBackend())
+
+    monkeypatch.setattr("trilitenet.commands.load.load", load)
+    assert cli.main(["serve", "own.safetensors", "--port", "0", "--network", "blocks.py:build"]) == 0
+    assert [options["network"] for options in told] == ["blocks.py:build"]
+
+
 def test_connections_are_refused_until_the_service_is_ready(
     started: list[Any], monkeypatch: pytest.MonkeyPatch, backend: FakeBackend
 ) -> None:

@@ -21,6 +21,7 @@ def serve(
     *,
     host: str = "127.0.0.1",
     port: int = 8000,
+    network: str | None = None,
     device: str = "auto",
     backend: str = "auto",
     confidence: float | None = None,
@@ -46,6 +47,7 @@ def serve(
         model: A shipped model, a file of weights, or an exported artefact.
         host: Address to listen on; 0.0.0.0 lets other machines in.
         port: Port to listen on.
+        network: The function that built a weight file's network, as for predict.
         device: Where the network runs, as for predict.
         backend: The runtime, as for predict.
         confidence: Boxes above this are kept; the model's own threshold if left out.
@@ -100,7 +102,12 @@ def serve(
     cv2.setNumThreads(1)  # images are the unit of parallel work here
     # The network's thread takes Python's lock often and briefly; with the usual 5 ms each other thread delays it.
     sys.setswitchinterval(0.0005)
-    with listener, load(model, device=device, backend=backend, confidence=confidence, streams=streams) as predictor:
+    with (
+        listener,
+        load(
+            model, network=network, device=device, backend=backend, confidence=confidence, streams=streams
+        ) as predictor,
+    ):
         if not max_batch:
             settings = dataclasses.replace(
                 settings, max_batch=getattr(predictor.backend, "streams", settings.max_batch)
