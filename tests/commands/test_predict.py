@@ -325,6 +325,73 @@ def test_an_interrupted_run_goes_on_where_it_was(
     assert (report.images, report.skipped) == (1, 1)
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 20])
+def test_shards_do_each_source_once_and_call_it_as_one_process_would(
+    folder: Path, tmp_path: Path, predictor: Predictor, count: int
+) -> None:
+    again = shutil.copytree(folder, tmp_path / "again")
+    videos = [drive(tmp_path / "one.mp4", 3), shutil.copy(tmp_path / "one.mp4", again / "one.mp4")]
+    (tmp_path / "broken.mp4").write_bytes(b"no video")
+    sources = [folder, videos[0], tmp_path / "broken.mp4", again, tmp_path / "absent.jpg"]
+    whole = predict_with(predictor, sources, tmp_path / "whole")
+    parts = [
+        predict_with(predictor, sources, tmp_path / "parts", shard=f"{index}/{count}", skip_existing=count == 2)
+        for index in range(count)
+    ]
+    written = [{path.name: path.read_bytes() for path in (tmp_path / each).iterdir()} for each in ("whole", "parts")]
+    assert written[0].keys() == written[1].keys() >= {"one.json", "one-2.json", "one-2.mp4", "grey-2.jpg"}
+    assert all(written[0][name] == content for name, content in written[1].items() if name.endswith("json"))
+    for figure in ("images", "videos", "frames"):
+        assert sum(getattr(part, figure) for part in parts) == getattr(whole, figure)
+    reasons = [failure.reason for part in parts for failure in part.failures]
+    assert sorted(reasons) == sorted(failure.reason for failure in whole.failures)
+
+
+def test_a_shard_opens_neither_what_others_do_nor_what_is_done(
+    tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    videos = [drive(tmp_path / f"{index}.mp4", 2) for index in range(4)]
+    opened: list[str] = []
+    plain = VideoReader.look
+
+    def look(self: VideoReader) -> None:
+        opened.append(Path(self.name).stem)
+        plain(self)
+
+    monkeypatch.setattr(VideoReader, "look", look)
+    options: dict[str, Any] = {"shard": "1/2", "skip_existing": True}
+    assert predict_with(predictor, videos, tmp_path / "out", **options).videos == 2
+    assert opened == ["1", "3"]
+    assert predict_with(predictor, videos, tmp_path / "out", **options).skipped == 2
+    assert opened == ["1", "3"]
+
+
+@pytest.mark.parametrize("shard", ["", "1", "2/2", "-1/2", "1/0", "0/0", "1.0/2", "a/b", "0 / 2", "1/" + "9" * 5000])
+def test_what_is_no_shard_is_one_line(folder: Path, tmp_path: Path, predictor: Predictor, shard: str) -> None:
+    with pytest.raises(ConfigError, match="--shard must be I/N with I from 0 to N - 1, such as 0/16, got "):
+        predict_with(predictor, [folder], tmp_path / "out", shard=shard)
+
+
+def test_sources_may_stand_in_a_file(
+    folder: Path, tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    listing = tmp_path / "list.txt"
+    listing.write_text(f"{folder / 'grey.png'}\n\n  {folder / 'deep.png'}  \r\n{folder / 'grey.png'}\n")
+    words = ["predict", str(folder / "alpha.png"), "--model", str(weights), "--output", str(tmp_path / "out")]
+    assert cli.main([*words, "--from-file", str(listing)]) == 0
+    assert {path.stem for path in (tmp_path / "out").iterdir()} == {"alpha", "grey", "deep"}
+    (tmp_path / "empty.txt").write_text("\n \n")
+    (tmp_path / "bytes.txt").write_bytes(b"\xff\xfe")
+    capsys.readouterr()
+    for name, told in {
+        "absent.txt": "cannot be read as text (No such file or directory)",
+        "bytes.txt": "cannot be read as text ('utf-8' codec can't decode",
+        "empty.txt": "names no source; write one a line",
+    }.items():
+        assert cli.main([*words, "--overwrite", "--from-file", str(tmp_path / name)]) == 1
+        assert told in capsys.readouterr().err
+
+
 def test_results_of_another_source_of_the_same_name_are_not_taken_for_done(
     folder: Path, tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -608,4 +675,4 @@ def test_what_is_asked_of_the_model_reaches_it(folder: Path, tmp_path: Path, mon
     words = [word for name, value in asked.items() for word in (f"--{name.replace('_', '-')}", str(value))]
     output = str(tmp_path / "out")
     assert cli.main(["predict", str(folder / "alpha.png"), *words, "--batch-size", "2", "--output", output]) == 0
-    assert given == {**asked, "batch_size": 2}
+    assert given == {**asked, "network": None, "batch_size": 2}

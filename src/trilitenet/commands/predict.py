@@ -155,6 +155,8 @@ def predict(
     hide: Sequence[str] = (),
     overwrite: bool = False,
     skip_existing: bool = False,
+    from_file: StrPath | None = None,
+    shard: str | None = None,
     every: int = 1,
     start: float = 0.0,
     end: float | None = None,
@@ -191,6 +193,9 @@ def predict(
         overwrite: Replace results that exist.
         skip_existing: Leave out sources whose results all exist, and do the others anew, as after an interruption; for
             overlays and formats with a file for each source.
+        from_file: Text file that names further sources, one a line.
+        shard: Do one part of all sources alone, as one of several processes or machines: 0/16 to 15/16. Results are
+            called as if one did them all.
         every: Of a video, take every so many frames.
         start: Of a video, begin at so many seconds.
         end: Of a video, stop at so many seconds.
@@ -218,7 +223,7 @@ def predict(
     options.open(still=False)  # what is wrong with them is told before any work
     clip = Clip(every=every, start=start, end=end, max_frames=max_frames)
     job = _Job(
-        sources,
+        [*sources, *(_read_list(from_file) if from_file is not None else ())],
         output,
         clip,
         format,
@@ -226,6 +231,7 @@ def predict(
         overlay=overlay,
         overwrite=overwrite,
         skip_existing=skip_existing,
+        shard=shard,
         rate=rate,
         preview=preview,
         road=options,
@@ -254,6 +260,7 @@ def predict_with(
     hide: Sequence[str] = (),
     overwrite: bool = False,
     skip_existing: bool = False,
+    shard: str | None = None,
     rate: float = 30.0,
     preview: bool = False,
     quiet: bool = True,
@@ -272,6 +279,7 @@ def predict_with(
         overlay=overlay,
         overwrite=overwrite,
         skip_existing=skip_existing,
+        shard=shard,
         rate=rate,
         preview=preview,
         road=road or RoadOptions(),
@@ -293,6 +301,7 @@ class _Job:
         overlay: bool,
         overwrite: bool,
         skip_existing: bool,
+        shard: str | None,
         rate: float,
         preview: bool,
         road: RoadOptions,
@@ -308,12 +317,15 @@ class _Job:
         self.preview = preview
         self.road = road
         self.clip = clip
-        self.sources, self.failures = find_sources(sources, clip, rate=rate)
+        part = _parse_shard(shard)
+        self.sources, self.failures = find_sources(sources, clip, rate=rate, unopened=True)
         self.formats = tuple(dict.fromkeys(formats))
         self.overwrite = overwrite or skip_existing  # then what exists is of a source that is done anew
         self.names = [name for source in self.sources for name in _names(source)]
         self.stems = _allot_stems(self.names)
         self._leave_out_long_names()
+        if part is not None:
+            self._keep_shard(*part)
         self.skipped = self._leave_out_done() if skip_existing else 0
         self._check_output()
         self._check_formats()
@@ -336,6 +348,12 @@ class _Job:
                 else:
                     self.failures.append(Failure(name, f"{name}: {reason}"))
         self._keep(fitting)
+
+    def _keep_shard(self, index: int, count: int) -> None:
+        """Leave out what other shards do, every so many-th source; what cannot be used is told by the first."""
+        self._keep(set(self.names[index::count]))
+        if index:
+            self.failures.clear()
 
     def _leave_out_done(self) -> int:
         """Leave out the sources whose results are all there and whole, and return how many.
@@ -405,7 +423,7 @@ class _Job:
         if self.output.exists() and not self.output.is_dir():
             raise OutputError(f"{self.output}: is a file; give a folder for --output")
         originals = {Path(name).resolve() for name in self.names if Path(name).exists()}
-        stems = set(self.stems.values())
+        stems = {self.stems[name] for source in self.sources for name in _names(source)}
         for folder in (self.output, self.output / "labels"):
             for path in sorted(folder.iterdir()) if folder.is_dir() else ():
                 if path.stem in stems and path.is_file():
@@ -483,6 +501,12 @@ class _Job:
         )
 
     def _run_source(self, source: Stills | FrameReader, predictor: Predictor, progress: Progress) -> None:
+        if isinstance(source, FrameReader):
+            try:
+                source.look()
+            except InputError as error:
+                self.failures.append(Failure(source.name, str(error)))
+                return
         name = "images" if isinstance(source, Stills) else PurePath(source.name).name
         total = len(source.paths) if isinstance(source, Stills) else source.expected
         task = progress.add_task(name, total=total)
@@ -559,6 +583,35 @@ def _follow(perception: Perception, parts: tuple[Steady | None, RoadMonitor | No
     if steady is not None:
         perception = steady(perception)
     return perception, None if monitor is None else monitor(perception)
+
+
+def _read_list(path: StrPath) -> list[str]:
+    """Return the lines of a text file that are not empty.
+
+    Raises:
+        InputError: If it cannot be read, or names nothing.
+    """
+    try:
+        names = [line for line in map(str.strip, Path(path).read_text(encoding="utf-8").splitlines()) if line]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text ({getattr(error, 'strerror', None) or error})") from error
+    if not names:
+        raise InputError(f"{path}: names no source; write one a line")
+    return names
+
+
+def _parse_shard(shard: str | None) -> tuple[int, int] | None:
+    """Return the number of a shard and how many there are.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    if shard is None:
+        return None
+    found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", shard)
+    if found is None or not int(found[1]) < int(found[2]):
+        raise ConfigError(f"--shard must be I/N with I from 0 to N - 1, such as 0/16, got {shard!r}")
+    return int(found[1]), int(found[2])
 
 
 def _check_source(path: Path, name: str) -> None:

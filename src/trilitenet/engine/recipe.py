@@ -33,7 +33,7 @@ class TrainConfig:
         input_size: (height, width) in pixels, multiples of 32 (Section IV-A: 640x384).
         augmentation: Strengths of the random transforms.
         variant: tiny, small or base (Section III-B).
-        network: A function of one's own that builds the network, called as `build_network` is: FILE.py:FUNCTION or
+        network: A function of your own that builds the network, called as `build_network` is: FILE.py:FUNCTION or
             MODULE:FUNCTION.
         tasks: Of detection, drivable and lane.
         pcaa: With partial class activation attention.

@@ -172,6 +172,13 @@ class FrameReader(abc.ABC):
         self._skipped = 0  # frames before the first that `_decode` gives
         self._closed = threading.Event()
 
+    def look(self) -> None:  # noqa: B027 - most know it from the beginning
+        """Find out ``rate`` and ``expected``, where that was put off.
+
+        Raises:
+            InputError: If the source cannot be read.
+        """
+
     def close(self) -> None:
         """Stop waiting for a stream to come back; from any thread."""
         self._closed.set()
@@ -219,31 +226,50 @@ class VideoReader(FrameReader):
         path: The file, its URL, or ``"-"`` for standard input.
         clip: Which frames are wanted.
         timeout: Seconds without data after which a URL is given up; None to wait for ever.
+        unopened: Leave it alone until `look` or the first frame, as of many files of which few may be wanted.
 
     Raises:
         InputError: If it is missing, empty, or no video.
         MissingExtraError: If PyAV is not installed.
     """
 
-    def __init__(self, path: str | Path, clip: Clip | None = None, *, timeout: float | None = None) -> None:
+    def __init__(
+        self, path: str | Path, clip: Clip | None = None, *, timeout: float | None = None, unopened: bool = False
+    ) -> None:
         super().__init__("stdin" if str(path) == "-" else _without_secrets(str(path)), clip)
         self._path = str(path)
         self._timeout = timeout
+        self._unopened = unopened
         if self._path == "-":
             self._cure = f"; an MP4 can be piped if {_INDEX_FIRST}"
+        elif unopened:
+            _av()
         else:
-            with self._open() as container:
-                stream = container.streams.video[0]
-                self.rate = _rate_of(container)
-                frames = stream.frames or None
-                if frames is None and container.duration and self.rate:
-                    frames = round(container.duration / 1e6 * self.rate)
-                self.expected = self.clip.expected(frames, self.rate)
+            self.look()
+
+    def look(self) -> None:
+        """Find out ``rate`` and ``expected`` from the file's head; of standard input neither is known.
+
+        Raises:
+            InputError: If it is missing, empty, or no video.
+        """
+        self._unopened = False
+        if self._path == "-":
+            return
+        with self._open() as container:
+            stream = container.streams.video[0]
+            self.rate = _rate_of(container)
+            frames = stream.frames or None
+            if frames is None and container.duration and self.rate:
+                frames = round(container.duration / 1e6 * self.rate)
+            self.expected = self.clip.expected(frames, self.rate)
 
     def _open(self) -> Any:
         return _open_container(self._path, self.name, timeout=self._timeout)
 
     def _decode(self) -> Any:
+        if self._unopened:
+            self.look()
         frames = None
         if self.clip.start and self._path != "-":
             with self._open() as container:
@@ -448,7 +474,7 @@ class Stills:
 
 
 def find_sources(
-    names: Sequence[str | Path], clip: Clip | None = None, *, rate: float = 30.0
+    names: Sequence[str | Path], clip: Clip | None = None, *, rate: float = 30.0, unopened: bool = False
 ) -> tuple[list[Stills | FrameReader], list[Failure]]:
     """Turn what a user names into sources.
 
@@ -457,6 +483,7 @@ def find_sources(
             pictures (``%06d``), URLs, a camera's number, ``-`` or ``stdin`` for standard input.
         clip: Which frames of videos are wanted.
         rate: Frames a second of numbered pictures.
+        unopened: Do not open video files: what is wrong with them is told by `FrameReader.look`.
 
     Returns:
         The sources in order, each once, neighbouring pictures together, no two readers of one name; and what cannot be
@@ -508,7 +535,7 @@ def find_sources(
                     continue
                 taken.add(where)
                 if path.suffix.lower() in VIDEO_SUFFIXES:
-                    add(functools.partial(VideoReader, path, clip), str(path))
+                    add(functools.partial(VideoReader, path, clip, unopened=unopened), str(path))
                 else:
                     stills.append(path)
     if stills:

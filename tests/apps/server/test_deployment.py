@@ -17,6 +17,7 @@ import yaml
 from starlette.testclient import TestClient
 
 from tests.apps.server.conftest import MakeApp
+from trilitenet.apps.cli import _repeated, build_app
 from trilitenet.apps.server.metrics import Metrics
 from trilitenet.apps.server.settings import Settings
 
@@ -75,6 +76,19 @@ def test_the_kubernetes_manifest_is_valid_and_safe() -> None:
     assert container["imagePullPolicy"] == "IfNotPresent"
     drain = float(container["args"][container["args"].index("--drain") + 1])
     assert pod["terminationGracePeriodSeconds"] > drain + 30
+
+
+def test_the_kubernetes_job_does_every_shard_once() -> None:
+    (job,) = _yaml("kubernetes/predict.yaml")
+    kubernetes_validate.validate(job, kubernetes_validate.latest_version(), strict=True)
+    pod = job["spec"]["template"]["spec"]
+    (container,) = pod["containers"]
+    assert container["securityContext"]["readOnlyRootFilesystem"] is True
+    (shard,) = [word for word in container["args"] if "$(" in word]
+    assert shard == f"$(SHARD)/{job['spec']['completions']}"
+    words = [word.replace("$(SHARD)", "15") for word in (*container["command"], *container["args"])]
+    assert words[0] == "trilitenet"
+    build_app(words[1:]).parse_args(_repeated(words[1:]), print_error=False, exit_on_error=False)
 
 
 def _expressions() -> list[str]:
