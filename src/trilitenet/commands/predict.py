@@ -32,6 +32,7 @@ from trilitenet.errors import (
     ShapeError,
     part_of,
     replacing,
+    shown,
     writing,
 )
 from trilitenet.formats.writers.base import Writer, file_stem, find_writer, open_writer, uninterrupted
@@ -610,7 +611,7 @@ def _parse_shard(shard: str | None) -> tuple[int, int] | None:
         return None
     found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", shard)
     if found is None or not int(found[1]) < int(found[2]):
-        raise ConfigError(f"--shard must be I/N with I from 0 to N - 1, such as 0/16, got {shard!r}")
+        raise ConfigError(f"--shard must be I/N with I from 0 to N - 1, such as 0/16, got {shown(shard)}")
     return int(found[1]), int(found[2])
 
 
