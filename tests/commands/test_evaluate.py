@@ -314,7 +314,7 @@ def test_what_is_asked_of_the_model_reaches_it(data: Path, monkeypatch: pytest.M
     monkeypatch.setattr("trilitenet.commands.evaluate.load", load)
     asked: dict[str, Any] = {
         "device": "cpu", "backend": "openvino", "confidence": 0.1, "iou": 0.2, "drivable": 0.3, "lane": 0.4,
-        "long_side": 320,
+        "long_side": 320, "network": "blocks.py:build",
     }  # fmt: skip
     with pytest.raises(WeightsError, match="far enough"):
         evaluate("m.onnx", data=data, **asked)

@@ -269,8 +269,8 @@ def test_a_teacher_gets_pixels_normalised_as_its_card_says(
     def look(_network: TriLiteNet, inputs: tuple[torch.Tensor]) -> None:
         pixels.extend(inputs)
 
-    def watched(path: str) -> TriLiteNet:
-        teacher = load_network(path)
+    def watched(path: str, network: str | None) -> TriLiteNet:
+        teacher = load_network(path, network)
         teacher.register_forward_pre_hook(look)
         return teacher
 

@@ -11,6 +11,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
+import torch.fx.config
+import torch.fx.traceback
 from numpy.typing import NDArray
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
@@ -45,7 +47,7 @@ def build_executorch(
         MissingExtraError: If ExecuTorch is not installed.
         BackendError: If it cannot lower the graph.
     """
-    with quiet(), _uncollected():
+    with quiet(), _uncollected(), _unrecorded():
         exir = import_extra("executorch.exir", "executorch")
         xnnpack = import_extra("executorch.backends.xnnpack.partition.xnnpack_partitioner", "executorch")
         traceable = Traceable(graph, card, info)
@@ -110,3 +112,20 @@ def _uncollected() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
+
+
+@contextlib.contextmanager
+def _unrecorded() -> Iterator[None]:
+    """Inside, nodes of graphs are made without a note of the lines of Python that made them, a fifth of the time.
+
+    Of which nodes they are made stays noted; those notes, which nothing changes, are shared instead of copied.
+    """
+    config, source = torch.fx.config, torch.fx.traceback.NodeSource
+    before = config.do_not_emit_stack_traces
+    config.do_not_emit_stack_traces = True
+    source.__deepcopy__ = lambda self, memo: self
+    try:
+        yield
+    finally:
+        config.do_not_emit_stack_traces = before
+        del source.__deepcopy__
