@@ -61,6 +61,14 @@ def test_names_are_whatever_they_are(tmp_path: Path, pictures: list[Perception])
     assert 'rider & "bike" <2>' in {track.get("label") for track in root.findall("track")}
 
 
+def test_a_name_that_xml_cannot_hold_spoils_no_file(tmp_path: Path, pictures: list[Perception]) -> None:
+    odd = dataclasses.replace(pictures[0], source="a\x01b\uffff\r\n.jpg", class_names=("vehicle", "bike\x00"))
+    images = write(tmp_path, [odd, *pictures[1:]]).findall("image")
+    assert images[0].get("name") == "a\\x01b\\uffff\r\n.jpg"
+    assert [box.get("label") for box in images[0].findall("box")] == ["vehicle", "bike\\x00"]
+    assert len(images) == len(pictures) > 1
+
+
 def test_each_video_has_a_file(tmp_path: Path, video: list[Perception]) -> None:
     other = [dataclasses.replace(frame, source="other.mp4") for frame in video[:2]]
     with CvatWriter(tmp_path) as writer:

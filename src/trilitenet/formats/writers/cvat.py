@@ -8,10 +8,11 @@ and the areas are polygons. Lines of lanes are polylines. A task needs the label
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
-from xml.sax.saxutils import escape, quoteattr
+from xml.sax import saxutils
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,8 @@ __all__ = ["CvatWriter", "cvat_mask"]
 
 _HEAD = '<?xml version="1.0" encoding="utf-8"?>\n<annotations>\n  <version>1.1</version>\n'
 
+_ILLEGAL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
+"""Characters that XML 1.0 has no way to hold."""
 _LINE = "lane line"
 _TOLERANCE = 1.0
 """A polygon of a video leaves the mask's outline by at most so many pixels."""
@@ -96,6 +99,19 @@ def cvat_mask(mask: NDArray[np.bool_]) -> tuple[str, int, int, int, int] | None:
     return text, left, top, inside.shape[1], inside.shape[0]
 
 
+def _held(text: str) -> str:
+    """Return a text with what XML cannot hold as Python writes it, so that one name does not spoil a whole file."""
+    return _ILLEGAL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+def _text(text: str) -> str:
+    return saxutils.escape(_held(text))
+
+
+def _quoted(text: str) -> str:
+    return saxutils.quoteattr(_held(text))
+
+
 def _labels(perception: Perception) -> str:
     """Return the labels that results like this one need, as CVAT's ``meta`` lists them."""
     names = [] if perception.boxes is None else [*perception.class_names]
@@ -106,7 +122,7 @@ def _labels(perception: Perception) -> str:
         "<mutable>True</mutable><input_type>text</input_type><default_value></default_value><values></values>"
         "</attribute></attributes></label>\n"
     )
-    return "      <labels>\n" + "".join(label.format(escape(name)) for name in names) + "      </labels>\n"
+    return "      <labels>\n" + "".join(label.format(_text(name)) for name in names) + "      </labels>\n"
 
 
 def _points(points: list[list[float]]) -> str:
@@ -133,7 +149,7 @@ class _ImagesFile:
     def add(self, perception: Perception, name: str, road: Mapping[str, Any] | None) -> None:
         height, width = perception.size
         write = self._handle.write
-        write(f'  <image id="{self.count}" name={quoteattr(name)} width="{width}" height="{height}">\n')
+        write(f'  <image id="{self.count}" name={_quoted(name)} width="{width}" height="{height}">\n')
         for label, mask in (("drivable", perception.drivable), ("lane", perception.lane)):
             encoded = None if mask is None else cvat_mask(mask)
             if encoded is not None:
@@ -144,7 +160,7 @@ class _ImagesFile:
                 )
         for found in objects(perception):
             write(
-                f'    <box label={quoteattr(found.name)} source="auto" occluded="0" '
+                f'    <box label={_quoted(found.name)} source="auto" occluded="0" '
                 f'{_corners(found.corners)} z_order="1">{_confidence(found.confidence)}</box>\n'
             )
         for _, points in polylines(road):
@@ -223,7 +239,7 @@ class _VideoFile:
         handle.write(f"      <original_size><width>{width}</width><height>{height}</height></original_size>\n")
         handle.write("    </task>\n  </meta>\n")
         for number, track in enumerate(self._tracks.values()):
-            handle.write(f'  <track id="{number}" label={quoteattr(track.label)} source="auto">\n')
+            handle.write(f'  <track id="{number}" label={_quoted(track.label)} source="auto">\n')
             handle.writelines(track.lines(following))
             handle.write("  </track>\n")
         handle.write("</annotations>\n")
