@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib.util
+import pickle
 import shutil
 from pathlib import Path
 
@@ -10,9 +11,11 @@ import torch
 
 import trilitenet
 from tests.artefacts import SIZE, Artefacts
+from tests.deploy.networks import lively_network
+from tests.deploy.test_graph import by_cell
 from tests.fakes import ColourBackend
-from trilitenet.config import Thresholds
-from trilitenet.errors import BackendError, ConfigError, WeightsError
+from trilitenet.config import TASKS, VARIANTS, Task, Thresholds
+from trilitenet.errors import BackendError, ConfigError, ShapeError, WeightsError
 from trilitenet.inference.openvino_backend import OpenVINOBackend
 from trilitenet.models.trilitenet import build_network
 from trilitenet.models.weights import save_network
@@ -65,7 +68,43 @@ def test_a_folder_called_like_a_model_is_not_taken_for_it(tmp_path: Path, monkey
     (tmp_path / "tiny").mkdir()
     (tmp_path / "tiny" / "a.param").touch()
     monkeypatch.chdir(tmp_path)
-    assert trilitenet.load("tiny", device="cpu").backend.name == "torch cpu"
+    assert trilitenet.load("tiny", device="cpu").backend.name == "torch cpu graph"
+
+
+@pytest.mark.parametrize(
+    ("classes", "tasks"), [(1, TASKS), (10, TASKS), (2, ("detection",)), (1, ("drivable",)), (1, ("lane",))]
+)
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_on_a_cpu_weights_run_as_their_deploy_graph(
+    tmp_path: Path, variant: str, classes: int, tasks: tuple[Task, ...], rng: np.random.Generator
+) -> None:
+    network = lively_network(variant, classes=classes, tasks=tasks)
+    save_network(network, tmp_path / "net.safetensors", network.card)
+    plain = trilitenet.load(tmp_path / "net.safetensors", device="cpu", backend="torch")
+    graph = trilitenet.load(tmp_path / "net.safetensors", device="cpu")
+    assert (plain.backend.name, graph.backend.name) == ("torch cpu", "torch cpu graph")
+    assert graph.backend.canvas is None
+    for size, batch in (((96, 160), 1), ((64, 96), 2)):
+        images = rng.integers(0, 256, (batch, *size, 3), np.uint8)
+        wanted, got = plain.backend.run(images), graph.backend.run(images)
+        assert (got.detection is None) == ("detection" not in tasks)
+        if got.detection is not None and wanted.detection is not None:
+            assert got.detection.dtype == np.float32
+            reordered = by_cell(torch.from_numpy(wanted.detection), *size).numpy()
+            np.testing.assert_allclose(got.detection, reordered, rtol=1e-3, atol=1e-3)
+        for task in ("drivable", "lane"):
+            mask, same = getattr(got, task), getattr(wanted, task)
+            assert (mask is None) == (task not in tasks)
+            if mask is not None:
+                assert mask.dtype == np.uint8
+                assert np.abs(mask.astype(int) - same).max() <= 1  # rounded, of 255
+    with pytest.raises(ShapeError, match="multiples of 32"):
+        graph.backend.run(np.zeros((1, 60, 96, 3), np.uint8))
+    copy = pickle.loads(pickle.dumps(graph))  # noqa: S301 - its own
+    np.testing.assert_array_equal(copy.perceive([images[0]])[0].draw(), graph.perceive([images[0]])[0].draw())
+    graph.close()
+    with pytest.raises(BackendError, match="the model was closed; load it again"):
+        graph.backend.run(images)
 
 
 def test_what_is_asked_of_openvino_reaches_it(artefacts: Artefacts) -> None:

@@ -57,7 +57,7 @@ def load(
             `build_network`; see `load_network`.
         device: auto (the best there is), cpu, cuda, cuda:1, mps.
         backend: auto (the fastest present that runs the file), torch, onnxruntime, openvino, ncnn, executorch or
-            tensorrt. A file of weights runs on PyTorch: on CUDA, auto is its deploy graph in fp16 under CUDA graphs,
+            tensorrt. A file of weights runs on PyTorch: auto is its deploy graph, on CUDA in fp16 under CUDA graphs,
             torch the plain network in fp32.
         confidence: Keep boxes whose confidence is above this, in [0, 1]; the model's own if left out.
         iou: A box goes when it overlaps a better one by more, in [0, 1]; the model's own if left out.
@@ -193,15 +193,19 @@ def _open_torch(model: str | os.PathLike[str], device: str, builder: Builder | N
 
     check_threads()
     network = load_network(model, builder)
-    if fastest and pick_device(device).type == "cuda" and not foreign_layers(network):
-        import torch
+    kind = pick_device(device).type
+    if not fastest or kind not in {"cpu", "cuda"} or foreign_layers(network):
+        return TorchBackend(network, device)
+    import torch
 
-        from trilitenet.deploy.graph import DeployGraph
-        from trilitenet.deploy.layouts import pick_layout
-        from trilitenet.inference.cuda_graph_backend import CudaGraphBackend
+    from trilitenet.deploy.graph import DeployGraph
+    from trilitenet.deploy.layouts import pick_layout
 
-        layout = pick_layout("auto", network.variant, "cuda")
-        graph = DeployGraph(network, layout, masks="probability").reduced(torch.float16)
-        graph.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        return CudaGraphBackend(graph, network.card, str(pick_device(device)))
-    return TorchBackend(network, device)
+    graph = DeployGraph(network, pick_layout("auto", network.variant, f"torch-{kind}"), masks="probability").eval()
+    if kind == "cpu":
+        return TorchBackend(network, device, graph=graph)
+    from trilitenet.inference.cuda_graph_backend import CudaGraphBackend
+
+    graph = graph.reduced(torch.float16)
+    graph.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return CudaGraphBackend(graph, network.card, str(pick_device(device)))

@@ -44,7 +44,8 @@ def pick_layout(name: str, variant: str, runtime: str, *, unit: Unit = "other") 
     Args:
         name: A key of `LAYOUTS`, or ``"auto"``.
         variant: ``"tiny"``, ``"small"`` or ``"base"``.
-        runtime: ``"openvino"``, ``"onnxruntime"``, ``"cuda"`` (PyTorch), or another, which gets the planar one.
+        runtime: ``"openvino"``, ``"onnxruntime"``, ``"torch-cpu"``, ``"torch-cuda"``, or another, which gets the planar
+            one.
         unit: The processor's, by which OpenVINO's layout goes: the wider, the cheaper the further arithmetic of wide
             cells.
 
@@ -57,8 +58,10 @@ def pick_layout(name: str, variant: str, runtime: str, *, unit: Unit = "other") 
         return LAYOUTS[name]
     if runtime == "onnxruntime":
         return LAYOUTS["planar-maximum-split" if variant == "base" else "planar-maximum-heads"]
-    if runtime == "cuda":
+    if runtime == "torch-cuda":
         return LAYOUTS["pixels"]
+    if runtime == "torch-cpu":
+        return LAYOUTS[f"vectors-{variant}"]
     if runtime != "openvino":
         return LAYOUTS["planar"]
     return LAYOUTS[_OPENVINO[unit][variant]]

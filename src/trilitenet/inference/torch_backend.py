@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from trilitenet.config import ModelCard
+from trilitenet.config import MAX_STRIDE, ModelCard
 from trilitenet.errors import BackendError
 from trilitenet.inference.backend import MOST_PARALLEL, check_batch, held, out_of_memory
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
@@ -71,13 +71,23 @@ class TorchBackend:
         network: The network; it is moved to the device and put in evaluation mode.
         device: As `pick_device` takes it.
         canvas: Fix the input to this (height, width), as artefacts do; None takes any size in multiples of 32.
+        graph: What to run in the network's place: a module or function of (B, H, W, 3) uint8 RGB pixels that returns
+            detections (B, N, 5 + classes) float32 and two masks (B, H, W) uint8 of 0 .. 255, None for a task it lacks.
 
     Raises:
         BackendError: If the device cannot be used, or the process lacks PyTorch's threads (see `check_threads`).
     """
 
-    def __init__(self, network: TriLiteNet, device: str = "auto", canvas: tuple[int, int] | None = None) -> None:
+    def __init__(
+        self,
+        network: TriLiteNet,
+        device: str = "auto",
+        canvas: tuple[int, int] | None = None,
+        *,
+        graph: Callable[[Tensor], Sequence[Tensor | None]] | None = None,
+    ) -> None:
         check_threads()
+        self._graph = graph
         self._canvas = canvas
         self.device = pick_device(device)
         self._card = network.card
@@ -96,7 +106,7 @@ class TorchBackend:
     @property
     def name(self) -> str:
         """The runtime and the device."""
-        return f"torch {self.device}"
+        return f"torch {self.device}{'' if self._graph is None else ' graph'}"
 
     @property
     def canvas(self) -> tuple[int, int] | None:
@@ -105,18 +115,18 @@ class TorchBackend:
 
     def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
         """Run the network on (B, H, W, 3) uint8 RGB; see `Backend.run`."""
-        check_batch(batch)
+        check_batch(batch, MAX_STRIDE)
         check_threads()
         batch = np.ascontiguousarray(batch)  # PyTorch takes no reversed axes
         try:
             with torch.inference_mode():
-                # NHWC seen as NCHW is the channels-last memory format: nothing is copied.
-                images = torch.from_numpy(batch).to(self.device, non_blocking=True).permute(0, 3, 1, 2)
-                outputs = self.network(normalise_images(images, self.card.mean, self.card.std))
+                network, pixels = self.network, torch.from_numpy(batch).to(self.device, non_blocking=True)
+                if self._graph is not None:
+                    return RawOutputs(*(None if one is None else one.cpu().numpy() for one in self._graph(pixels)))
+                images = pixels.permute(0, 3, 1, 2)  # seen so it is channels-last in memory: nothing is copied
+                outputs = network(normalise_images(images, self.card.mean, self.card.std))
                 return RawOutputs(
-                    detection=(
-                        None if outputs.detection is None else self.network.decode(outputs).float().cpu().numpy()
-                    ),
+                    detection=(None if outputs.detection is None else network.decode(outputs).float().cpu().numpy()),
                     drivable=None if outputs.drivable is None else _foreground(outputs.drivable),
                     lane=None if outputs.lane is None else _foreground(outputs.lane),
                 )
@@ -141,7 +151,7 @@ class TorchBackend:
 
     def close(self) -> None:
         """Let the network go."""
-        self._network = None
+        self._network = self._graph = None
 
 
 def _foreground(logits: Tensor) -> NDArray[np.uint8]:
