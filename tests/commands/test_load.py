@@ -103,6 +103,7 @@ def test_on_a_cpu_weights_run_as_their_deploy_graph(
     copy = pickle.loads(pickle.dumps(graph))  # noqa: S301 - its own
     np.testing.assert_array_equal(copy.perceive([images[0]])[0].draw(), graph.perceive([images[0]])[0].draw())
     graph.close()
+    assert graph.backend.name == "torch cpu graph"
     with pytest.raises(BackendError, match="the model was closed; load it again"):
         graph.backend.run(images)
 

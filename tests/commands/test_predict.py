@@ -362,8 +362,10 @@ def test_a_shard_opens_neither_what_others_do_nor_what_is_done(
     options: dict[str, Any] = {"shard": "1/2", "skip_existing": True}
     assert predict_with(predictor, videos, tmp_path / "out", **options).videos == 2
     assert opened == ["1", "3"]
+    read: list[str] = []
+    monkeypatch.setattr("trilitenet.commands.predict._check_source", lambda path, name: read.append(path.stem))
     assert predict_with(predictor, videos, tmp_path / "out", **options).skipped == 2
-    assert opened == ["1", "3"]
+    assert opened == read == ["1", "3"]
 
 
 @pytest.mark.parametrize("shard", ["", "1", "2/2", "-1/2", "1/0", "0/0", "1.0/2", "a/b", "0 / 2", "1/" + "9" * 5000])

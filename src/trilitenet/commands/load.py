@@ -29,6 +29,8 @@ _RUNS: Final[dict[str, tuple[str, ...]]] = {
     ".engine": ("tensorrt",),
 }
 """Runtimes of a file by its suffix; others run on PyTorch."""
+_EXPORTED: Final = frozenset({*_RUNS, ".pt2"})
+"""Suffixes of files that hold their network."""
 _MADE: Final = {"onnxruntime": "onnx"}
 """What to export for a runtime that is not called as its format is."""
 
@@ -111,7 +113,7 @@ def own_builder(model: str | os.PathLike[str], network: str | None) -> str | Non
         WeightsError: If the file is broken.
     """
     path = Path(os.fspath(model))
-    if network is None or path.suffix.lower() in {*_RUNS, ".pt2"} or path.is_dir():
+    if network is None or path.suffix.lower() in _EXPORTED or path.is_dir():
         return None
     from trilitenet.models.weights import read_builder
 
@@ -143,7 +145,7 @@ def open_backend(
     if str(model) not in VARIANTS and path.is_dir() and any(path.glob("*.param")):
         suffix = ".param"
     runs = _RUNS.get(suffix, ("torch",))
-    if network is not None and (suffix in _RUNS or suffix == ".pt2"):
+    if network is not None and suffix in _EXPORTED:
         raise ConfigError(f"{model}: is an exported file, which holds its network; leave --network out")
     if backend == "auto":
         # OpenVINO was the faster of the two on every processor measured (docs/speed.md); it has no CUDA.
@@ -153,8 +155,7 @@ def open_backend(
         backend = (usable or runs)[0]
     elif backend not in runs:
         cure = f"; make a file for it with: trilitenet export {model} --format {_MADE.get(backend, backend)}"
-        exported = suffix in _RUNS or suffix == ".pt2"
-        raise ConfigError(f"{model} runs on {' or '.join(runs)}, not on {backend}{'' if exported else cure}")
+        raise ConfigError(f"{model} runs on {' or '.join(runs)}, not on {backend}{'' if suffix in _EXPORTED else cure}")
     if backend == "openvino":
         from trilitenet.inference.openvino_backend import OpenVINOBackend
 
@@ -194,7 +195,8 @@ def _open_torch(model: str | os.PathLike[str], device: str, builder: Builder | N
     check_threads()
     network = load_network(model, builder)
     kind = pick_device(device).type
-    if not fastest or kind not in {"cpu", "cuda"} or foreign_layers(network):
+    # Without a function of its own there are no layers but ours: `load_network` sees to that.
+    if not fastest or kind not in {"cpu", "cuda"} or (builder is not None and foreign_layers(network)):
         return TorchBackend(network, device)
     import torch
 

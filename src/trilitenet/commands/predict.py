@@ -322,7 +322,7 @@ class _Job:
         self.sources, self.failures = find_sources(sources, clip, rate=rate, unopened=True)
         self.formats = tuple(dict.fromkeys(formats))
         self.overwrite = overwrite or skip_existing  # then what exists is of a source that is done anew
-        self.names = [name for source in self.sources for name in _names(source)]
+        self.names = self._left()
         self.stems = _allot_stems(self.names)
         self._leave_out_long_names()
         if part is not None:
@@ -373,7 +373,7 @@ class _Job:
                         "all; choose another --format, or --overwrite"
                     )
         if "json" in self.formats:
-            for name in self.names:
+            for name in self._left():
                 _check_source(self.output / f"{self.stems[name]}.json", name)
         left = {
             name
@@ -381,9 +381,13 @@ class _Job:
             for name in _names(source)
             if self._mark(name).exists() or not all(path.exists() for path in self._files(source, name))
         }
-        before = sum(len(_names(source)) for source in self.sources)
+        before = len(self._left())
         self._keep(left)
         return before - len(left)
+
+    def _left(self) -> list[str]:
+        """Return the names of the sources, and of the pictures among them, that are to be done."""
+        return [name for source in self.sources for name in _names(source)]
 
     def _keep(self, names: Collection[str]) -> None:
         """Leave out the sources, and the pictures among them, of other names."""
@@ -423,15 +427,17 @@ class _Job:
     def _check_output(self) -> None:
         if self.output.exists() and not self.output.is_dir():
             raise OutputError(f"{self.output}: is a file; give a folder for --output")
-        originals = {Path(name).resolve() for name in self.names if Path(name).exists()}
-        stems = {self.stems[name] for source in self.sources for name in _names(source)}
-        for folder in (self.output, self.output / "labels"):
-            for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-                if path.stem in stems and path.is_file():
-                    if path.resolve() in originals:
-                        raise OutputError(f"{path}: results would lie beside their source; choose another --output")
-                    if not self.overwrite:
-                        raise OutputError(f"{path}: exists already; choose another --output or add --overwrite")
+        stems = {self.stems[name] for name in self._left()}
+        folders = [folder for folder in (self.output, self.output / "labels") if folder.is_dir()]
+        alike = [
+            path for folder in folders for path in sorted(folder.iterdir()) if path.stem in stems and path.is_file()
+        ]
+        originals = {Path(name).resolve() for name in self.names if Path(name).exists()} if alike else set()
+        for path in alike:
+            if path.resolve() in originals:
+                raise OutputError(f"{path}: results would lie beside their source; choose another --output")
+            if not self.overwrite:
+                raise OutputError(f"{path}: exists already; choose another --output or add --overwrite")
 
     def _check_formats(self) -> None:
         """Refuse formats that do not exist, and files that exist or would be written twice."""

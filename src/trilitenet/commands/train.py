@@ -30,6 +30,7 @@ from rich.progress import (
 )
 from rich.table import Column
 
+from trilitenet.commands.load import own_builder
 from trilitenet.commands.paths import StrPath, optional_path
 from trilitenet.commands.progress import show_bars
 from trilitenet.config import DEFAULT_ANCHORS, ModelCard, parse_yaml
@@ -58,7 +59,7 @@ from trilitenet.losses.multitask import MultiTaskLoss
 from trilitenet.losses.segmentation import SegmentationLoss
 from trilitenet.models.builders import build_by
 from trilitenet.models.trilitenet import TriLiteNet
-from trilitenet.models.weights import load_network, read_builder
+from trilitenet.models.weights import load_network
 
 __all__ = ["build_loss", "train", "training_data", "validation_figures"]
 
@@ -265,7 +266,9 @@ def _transform(config: TrainConfig, dataset: SampleSource, display: _Display) ->
 def _network(config: TrainConfig, dataset: SampleSource, display: _Display, *, resume: bool) -> TriLiteNet:
     """Build the network: anchors, initial weights, frozen parts."""
     anchors = config.anchors
-    initial = _weights(config, config.init) if config.init is not None and not resume else None
+    initial = None
+    if config.init is not None and not resume:
+        initial = load_network(config.init, own_builder(config.init, config.network))
     if config.auto_anchor and anchors is None and "detection" in config.tasks and not resume:
         swapped = config.swapped_anchors
         sizes = box_sizes(dataset, config.input_size, seed=config.seed, swapped=swapped, progress=display.anchors)
@@ -292,11 +295,6 @@ def _network(config: TrainConfig, dataset: SampleSource, display: _Display, *, r
             network.anchors.copy_(fitted)
     freeze(network, config.freeze)
     return network
-
-
-def _weights(config: TrainConfig, path: str) -> TriLiteNet:
-    """Load weights of an ordinary network, or of one that the run's own function builds."""
-    return load_network(path, config.network if read_builder(path) is not None else None)
 
 
 def _card(config: TrainConfig, network: TriLiteNet, dataset: SampleSource, recipe: Path | None) -> ModelCard:
@@ -338,7 +336,7 @@ def build_loss(config: TrainConfig, network: TriLiteNet) -> MultiTaskLoss:
 def _teacher(config: TrainConfig, network: TriLiteNet) -> tuple[TriLiteNet, DistillationLoss] | None:
     if config.teacher is None or Path(config.teacher).is_dir():
         return None
-    teacher = _weights(config, config.teacher)
+    teacher = load_network(config.teacher, own_builder(config.teacher, config.network))
     if not set(teacher.tasks) & set(network.tasks):
         raise ConfigError(f"{config.teacher}: the teacher has none of the tasks {', '.join(network.tasks)}")
     told, wanted = teacher.card.class_names, network.card.class_names

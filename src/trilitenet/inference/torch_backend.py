@@ -90,6 +90,7 @@ class TorchBackend:
         self._graph = graph
         self._canvas = canvas
         self.device = pick_device(device)
+        self._name = f"torch {self.device}{'' if graph is None else ' graph'}"
         self._card = network.card
         self._network: TriLiteNet | None = network.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
@@ -106,7 +107,7 @@ class TorchBackend:
     @property
     def name(self) -> str:
         """The runtime and the device."""
-        return f"torch {self.device}{'' if self._graph is None else ' graph'}"
+        return self._name
 
     @property
     def canvas(self) -> tuple[int, int] | None:
@@ -120,9 +121,10 @@ class TorchBackend:
         batch = np.ascontiguousarray(batch)  # PyTorch takes no reversed axes
         try:
             with torch.inference_mode():
-                network, pixels = self.network, torch.from_numpy(batch).to(self.device, non_blocking=True)
-                if self._graph is not None:
-                    return RawOutputs(*(None if one is None else one.cpu().numpy() for one in self._graph(pixels)))
+                network, graph = self.network, self._graph
+                pixels = torch.from_numpy(batch).to(self.device, non_blocking=True)
+                if graph is not None:
+                    return RawOutputs(*(None if one is None else one.cpu().numpy() for one in graph(pixels)))
                 images = pixels.permute(0, 3, 1, 2)  # seen so it is channels-last in memory: nothing is copied
                 outputs = network(normalise_images(images, self.card.mean, self.card.std))
                 return RawOutputs(

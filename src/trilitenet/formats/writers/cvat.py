@@ -104,10 +104,6 @@ def _held(text: str) -> str:
     return _ILLEGAL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
-def _text(text: str) -> str:
-    return saxutils.escape(_held(text))
-
-
 def _quoted(text: str) -> str:
     return saxutils.quoteattr(_held(text))
 
@@ -122,7 +118,9 @@ def _labels(perception: Perception) -> str:
         "<mutable>True</mutable><input_type>text</input_type><default_value></default_value><values></values>"
         "</attribute></attributes></label>\n"
     )
-    return "      <labels>\n" + "".join(label.format(_text(name)) for name in names) + "      </labels>\n"
+    return (
+        "      <labels>\n" + "".join(label.format(saxutils.escape(_held(name))) for name in names) + "      </labels>\n"
+    )
 
 
 def _points(points: list[list[float]]) -> str:
