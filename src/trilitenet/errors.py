@@ -128,9 +128,9 @@ def brief(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}" if isinstance(error, UnicodeError) else repr(error)
 
 
-def gist(error: BaseException) -> str:
-    """Return on one line what another library says; of a long text its beginning and its end, where causes stand."""
-    text = " ".join(str(error).split())
+def gist(said: object) -> str:
+    """Return on one line what another library says (an error, a text); of a long one both ends, where causes stand."""
+    text = " ".join(str(said).split())
     if len(text) <= _MOST_SHOWN:
         return text
     return f"{text[: _MOST_SHOWN - _END - 5]} ... {text[-_END:]}"

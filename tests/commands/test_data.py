@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import tarfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +22,7 @@ from tests.formats.readers import raw_bdd
 from trilitenet.apps.cli import main
 from trilitenet.commands import data as command
 from trilitenet.commands.data import _widths, check, convert, prepare, show
+from trilitenet.commands.evaluate import evaluate
 from trilitenet.commands.train import training_data
 from trilitenet.data.check_page import check_page
 from trilitenet.data.checking import CheckReport
@@ -351,3 +353,32 @@ def test_training_uses_the_prepared_copy(published: Path) -> None:
     assert isinstance(training_data(TrainConfig(data=str(published))), DrivingDataset)
     prepare(published, workers=1)
     assert isinstance(training_data(TrainConfig(data=str(published))), PreparedDataset)
+
+
+_TAKE_A_FOLDER: list[Callable[[Path, Path], object]] = [
+    lambda root, out: check(root),
+    lambda root, out: prepare(root, out),
+    lambda root, out: show(root, out / "sheet.png"),
+    lambda root, out: evaluate("tiny", data=root),
+    lambda root, out: convert(root, out, kind="bdd100k"),
+    lambda root, out: convert(root, out, kind="masks"),
+    lambda root, out: convert(root, out, kind="coco"),
+    lambda root, out: convert(root, out, kind="yolo"),
+    lambda root, out: convert(root, out, kind="cvat"),
+]
+
+
+@pytest.mark.parametrize("call", _TAKE_A_FOLDER)
+def test_a_folder_that_is_not_there_is_told(call: Callable[[Path, Path], object], tmp_path: Path) -> None:
+    missing, out = tmp_path / "nowhere", tmp_path / "out"
+    with pytest.raises(DataError, match=f"^{re.escape(str(missing))}: no such folder$"):
+        call(missing, out)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("call", _TAKE_A_FOLDER[:6])
+def test_a_file_in_place_of_the_folder_is_told(call: Callable[[Path, Path], object], tmp_path: Path) -> None:
+    file = tmp_path / "notes.txt"
+    file.touch()
+    with pytest.raises(DataError, match=f"^{re.escape(str(file))}: is a file, not the folder of a data set$"):
+        call(file, tmp_path / "out")

@@ -205,7 +205,7 @@ def test_description_round_trip(tmp_path: Path) -> None:
 
 
 def test_errors_name_the_file(root: Path) -> None:
-    with pytest.raises(DataError, match="no folder images/val"):
+    with pytest.raises(DataError, match=r"no folder images/val; its splits: train$"):
         DrivingDataset(root, "val")
     with pytest.raises(DataError, match=rf"^{re.escape(str(root))}: category 'car' belongs to both"):
         DrivingDataset(root, "train", class_names=("vehicle", "car"))

@@ -24,7 +24,7 @@ from trilitenet.data.converting import convert as run_conversion
 from trilitenet.data.description import DatasetDescription, folder_name
 from trilitenet.data.prepared import CACHE_FOLDER, is_prepared
 from trilitenet.data.prepared import prepare as run_preparation
-from trilitenet.data.reading import DrivingDataset, split_folders
+from trilitenet.data.reading import DrivingDataset, check_root, split_folders
 from trilitenet.data.records import RecordSource
 from trilitenet.data.sample import Sample
 from trilitenet.engine.report import render
@@ -480,6 +480,7 @@ def _what_is_unknown(wanted: Mapping[str, str], known: Mapping[str, Collection[s
 
 
 def _splits(root: Path) -> list[str]:
+    check_root(root)
     if is_prepared(root):
         raise DataError(f"{root}: is a prepared data set; show the one that it was made from")
     splits = [path.name for path in split_folders(root)]

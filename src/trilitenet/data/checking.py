@@ -28,6 +28,7 @@ from trilitenet.data.prepared import is_prepared
 from trilitenet.data.reading import (
     IMAGE_FOLDER,
     LABEL_FILES,
+    check_root,
     decode_mask,
     is_crowd,
     is_image_file,
@@ -238,8 +239,7 @@ def check_dataset(
     """
     import_extra("imagehash", "data")
     root = Path(root)
-    if not root.is_dir():
-        raise DataError(f"{root}: no such folder")
+    check_root(root)
     layout, words = detect_layout(root)
     if layout == "prepared":
         raise DataError(f"{root}: is {words}; check the data set that it was made from")

@@ -44,6 +44,7 @@ from trilitenet.data.reading import (
     PREPARED_FILE,
     DrivingDataset,
     SampleSource,
+    check_root,
     decode_image,
     is_image_file,
     label_file,
@@ -144,6 +145,7 @@ def prepare(
         DataError: If the data set is broken, or no box is of one of the ``class_names`` that are given.
     """
     root = Path(root)
+    check_root(root)
     out = Path(out) if out is not None else root / CACHE_FOLDER
     names = tuple(class_names or read_description(root).class_names)
     _check(canvas, quality, mask_above, shard_size)

@@ -40,6 +40,7 @@ __all__ = [
     "DrivingDataset",
     "MixedDataset",
     "SampleSource",
+    "check_root",
     "decode",
     "decode_image",
     "decode_mask",
@@ -90,6 +91,16 @@ class SampleSource(Protocol):
 def is_image_file(name: str) -> bool:
     """Return whether a file's name is one of an image; hidden ones, such as ``._0001.jpg`` of macOS, are none."""
     return not name.startswith(".") and name.lower().endswith(IMAGE_ENDINGS)
+
+
+def check_root(root: Path) -> None:
+    """Check that the folder of a data set is there.
+
+    Raises:
+        DataError: If it is not, or is a file.
+    """
+    if not root.is_dir():
+        raise DataError(f"{root}: {'is a file, not the folder of a data set' if root.exists() else 'no such folder'}")
 
 
 def split_folders(root: Path, top: str = IMAGE_FOLDER) -> list[Path]:
@@ -546,9 +557,12 @@ def _image_files(root: Path, split: str) -> dict[str, str]:
     """Return image name -> file name of a split."""
     folder = root / IMAGE_FOLDER / split
     if not folder.is_dir():
+        check_root(root)
         if (root / PREPARED_FILE).is_file():
             raise DataError(f"{root}: a prepared copy, for training alone; name the data set it was made from")
-        raise DataError(f"{root}: no folder {IMAGE_FOLDER}/{split}; expected the published layout, see docs/data.md")
+        splits = few([path.name for path in split_folders(root)])
+        cure = f"its splits: {splits}" if splits else "expected the published layout, see docs/data.md"
+        raise DataError(f"{root}: no folder {IMAGE_FOLDER}/{split}; {cure}")
     files: dict[str, str] = {}
     for file in sorted(path.name for path in folder.iterdir()):  # as text, which is many times as fast
         if not is_image_file(file):

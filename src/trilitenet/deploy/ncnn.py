@@ -18,7 +18,7 @@ import torch
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, GRAPH_HASH_KEY, WEIGHTS_HASH_KEY, ArtefactInfo, ModelCard
 from trilitenet.deploy.graph import DeployGraph, Traceable
 from trilitenet.deploy.quiet import quiet
-from trilitenet.errors import BackendError, import_extra, scratch_folder
+from trilitenet.errors import BackendError, gist, import_extra, scratch_folder
 
 __all__ = ["NcnnModel", "build_ncnn", "save_ncnn"]
 
@@ -70,7 +70,7 @@ def build_ncnn(graph: DeployGraph, card: ModelCard, info: ArtefactInfo) -> NcnnM
             raise BackendError(f"pnnx does not run here ({error})") from error
         param, weights = folder / "graph.ncnn.param", folder / "graph.ncnn.bin"
         if done.returncode or not param.is_file() or not weights.is_file():
-            said = (done.stderr.strip() or done.stdout.strip() or "it said nothing").splitlines()[-1][:160]
+            said = gist((done.stderr.strip() or done.stdout.strip() or "it said nothing").splitlines()[-1])
             raise BackendError(f"pnnx cannot convert the deploy graph (exit status {done.returncode}: {said})")
         names = {"in0": "image"} | {f"out{index}": task for index, task in enumerate(card.tasks)}
         return NcnnModel(_rename_blobs(param.read_text(encoding="utf-8"), names), weights.read_bytes())

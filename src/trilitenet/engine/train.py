@@ -609,7 +609,7 @@ class Trainer:
         try:
             self._take_over(state)
         except (RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
-            reason = brief(error)[:200]  # of a network it names every tensor
+            reason = gist(brief(error))  # of a network it names every tensor
             raise WeightsError(f"{path}: does not fit this run ({reason}); start anew with --overwrite") from error
         self._saved = self.step
         self._best_of = state.get("best_of")

@@ -26,7 +26,7 @@ from typing import Any, Final
 
 from trilitenet.config import TASKS, Task, parse_json
 from trilitenet.data.rasterise import flatten
-from trilitenet.data.reading import IMAGE_ENDINGS, is_crowd
+from trilitenet.data.reading import IMAGE_ENDINGS, check_root, is_crowd
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel, same_name
 from trilitenet.errors import DataError, brief, few
 from trilitenet.formats.readers.mapping import Labels, visible
@@ -156,8 +156,7 @@ def read_bdd100k(raw: str | Path, *, crosswalk: bool = False, vertical: bool = F
         DataError: If there are no images; the message says what was looked for.
     """
     root = Path(raw)
-    if not root.is_dir():
-        raise DataError(f"{root}: no such folder")
+    check_root(root)
     folders, files = _survey(root)
     splits: dict[str, _Split] = {}
     found: list[str] = []

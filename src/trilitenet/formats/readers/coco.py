@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trilitenet.data.reading import check_root
 from trilitenet.data.records import (
     AreaLabel,
     BrokenRecord,
@@ -71,6 +72,7 @@ def _annotation_files(root: Path, default: str) -> tuple[list[tuple[Path, str, A
     """Return (file, split, content) of the files to read, and the files that are left out for them."""
     if root.is_file():
         return [(root, default, read_json(root))], []
+    check_root(root)
     files = visible({*root.glob("*.json"), *root.glob("annotations/*.json"), *root.glob("*/_annotations.coco.json")})
     chosen: list[tuple[Path, str, Any]] = []
     for whole in (True, False):  # COCO's own captions and key points are of the images of instances_*.json

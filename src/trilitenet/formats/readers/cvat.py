@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from trilitenet.data.reading import check_root
 from trilitenet.data.records import (
     AreaLabel,
     BrokenRecord,
@@ -59,6 +60,7 @@ def read_cvat(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
     root = Path(root)
     files = [root] if root.is_file() else visible(root.glob("*.xml"))
     if not files:
+        check_root(root)
         raise DataError(f"{root}: no .xml file; export the task from CVAT as 'CVAT for images 1.1'")
     folder = root.parent if root.is_file() else root
     records: dict[str, list[ImageRecord]] = defaultdict(list)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from trilitenet.config import TASKS
-from trilitenet.data.reading import is_image_file
+from trilitenet.data.reading import check_root, is_image_file
 from trilitenet.data.records import ImageRecord, ListedRecords, MaskFile
 from trilitenet.errors import DataError
 from trilitenet.formats.readers.mapping import LabelMapping, MaskRule
@@ -26,6 +26,7 @@ def read_masks(root: str | Path, mapping: LabelMapping | None = None) -> ListedR
     """
     mapping = mapping or LabelMapping()
     root = Path(root)
+    check_root(root)
     records: dict[str, list[ImageRecord]] = {}
     found = []
     tasks = mapping.tasks or TASKS

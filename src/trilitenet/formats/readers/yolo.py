@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from trilitenet.config import Task, read_yaml
-from trilitenet.data.reading import is_image_file
+from trilitenet.data.reading import check_root, is_image_file
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ObjectLabel, image_size, name_apart, same_name
 from trilitenet.errors import ConfigError, DataError, brief, few
 from trilitenet.formats.readers.mapping import LabelMapping, Labels, hull, visible
@@ -178,6 +178,7 @@ def _find_yaml(root: Path) -> Path:
     for path in [root / "data.yaml", *visible(root.glob("*.y*ml"))]:
         if path.is_file() and "names" in _read_text(path):
             return path
+    check_root(root)
     raise DataError(f"{root}: no data.yaml with 'names'")
 
 
