@@ -17,7 +17,7 @@ PYTEST_ARGS ?=
 DEMO ?= demo-output
 # ExecuTorch is built for this version of PyTorch, which pip would install in place of another; without it its tests are skipped.
 comma := ,
-EXTRAS := all$(if $(findstring 2.13,$(TORCH)),$(comma)executorch)
+EXTRAS := all$(if $(filter torch==2.13%,$(TORCH)),$(comma)executorch)
 
 INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile
 # On all cores, where pip compiles on one; some packages hold files for other versions of Python. Their tests stay.

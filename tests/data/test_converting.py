@@ -287,14 +287,14 @@ def test_what_was_added_to_the_description_stays(tmp_path: Path) -> None:
     source = Records(train=[first])
     convert(source, tmp_path / "out", description=DatasetDescription(licence="MIT"))
     with (tmp_path / "out/dataset.yaml").open("a") as file:
-        file.write("ego_mask: bonnet.png\ntasks: [detection]\n")
+        file.write("ego_mask: bonnet.png\ntasks: [detection]\nignore: [train]\n")
     before = (tmp_path / "out/dataset.yaml").read_text()
     convert(source, tmp_path / "out")
     assert (tmp_path / "out/dataset.yaml").read_text() == before
     source = Records(train=[first], val=[picture(tmp_path / "raw/b.png", objects=(CAR,))])
     convert(source, tmp_path / "out", description=DatasetDescription(licence="CC0"))
     about = read_description(tmp_path / "out")
-    assert (about.ego_mask, about.tasks) == ("bonnet.png", ("detection",))
+    assert (about.ego_mask, about.tasks, about.ignore) == ("bonnet.png", ("detection",), ("train",))
     assert (about.name, about.licence, about.splits) == ("out", "CC0", ("train", "val"))
     text = (tmp_path / "out/dataset.yaml").read_text().replace("above: 1\n", "above: 100\n", 1)
     (tmp_path / "out/dataset.yaml").write_text(text.replace("ignore: []\n", "ignore: [127]\n", 1))

@@ -4,6 +4,7 @@ import contextlib
 import errno
 import logging
 import os
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -265,6 +266,42 @@ def test_remote_shards_are_copied_when_used(root: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "copies/train-000000.tar").exists()
     with pytest.raises(DataError, match="give `cache`"):
         PreparedDataset(address, "val")
+
+
+def test_copies_of_remote_shards_are_of_one_state(root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    pytest.importorskip("webdataset")
+    copies = tmp_path / "copies"
+    prepare(root, tmp_path / "out", canvas=CANVAS)
+    address = (tmp_path / "out").as_uri()
+    first = PreparedDataset(address, "val", cache=copies)
+    image = first[0].image
+    other = tmp_path / "other"
+    write_published(other, "val", 3, (50, 90), seed=7)
+    prepare(other, tmp_path / "two", canvas=CANVAS)
+    second = PreparedDataset((tmp_path / "two").as_uri(), "val", cache=copies)[0].image
+    assert not np.array_equal(second, image)
+    for folder in ("images", "det_annotations"):
+        shutil.rmtree(root / folder / "val")
+        shutil.copytree(other / folder / "val", root / folder / "val")
+    prepare(root, tmp_path / "out", canvas=CANVAS)
+    again = PreparedDataset(address, "val", cache=copies)
+    for index, sample in enumerate(PreparedDataset(tmp_path / "out", "val")):
+        np.testing.assert_array_equal(again[index].image, sample.image)
+        np.testing.assert_array_equal(again[index].boxes, sample.boxes)
+    shutil.rmtree(tmp_path / "out")  # as if the network were down
+    np.testing.assert_array_equal(PreparedDataset(address, "val", cache=copies)[0].image, again[0].image)
+    assert "going on with the copies" in caplog.text
+
+
+def test_other_pixels_make_another_data_set(root: Path, tmp_path: Path) -> None:
+    identities = []
+    for _ in range(2):
+        prepare(root, tmp_path / "out", canvas=CANVAS)
+        identities.append(identify(PreparedDataset(tmp_path / "out", "val")))
+        path = root / "ll_seg_annotations/val/val_0001.png"
+        cv2.imwrite(str(path), 255 - np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)))
+    assert tell_apart(*identities) is None
+    assert tell_apart(*identities, strict=True) == "other images or labels of the same names"
 
 
 @pytest.mark.slow

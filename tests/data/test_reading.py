@@ -110,6 +110,15 @@ def test_categories_crowds_and_boxes_beyond_the_image(root: Path) -> None:
     assert len(two.ignored) == 2
 
 
+def test_a_category_that_is_a_number_is_the_text_of_it(root: Path) -> None:
+    write_annotation(root, "train", "train_0000", [{"category": 3, "box2d": {"x1": 1, "y1": 2, "x2": 9, "y2": 8}}])
+    dataset = DrivingDataset(root, "train", class_names=("vehicle",), classes={"vehicle": ("3",)})
+    boxes = dataset[0].boxes
+    assert boxes is not None
+    assert boxes.tolist() == [[1, 2, 9, 8]]
+    assert dataset.classes_without_boxes() == ([], {"3"})
+
+
 def test_a_category_to_ignore_is_ignored_though_a_class_has_it(root: Path) -> None:
     """As the check and the conversion have it; trains are vehicles unless something is said."""
     write_annotation(root, "train", "train_0000", [box("car", 0), box("train", 20)])
@@ -333,6 +342,20 @@ def test_an_image_of_an_absurd_size_is_a_broken_one() -> None:
         decode_image(data, "huge.png")
     with pytest.raises(DataError, match=r"huge\.png: not a mask"):
         decode_mask(data, "huge.png", MaskMeaning())
+
+
+def test_another_ego_mask_makes_another_sample(root: Path) -> None:
+    before = DrivingDataset(root, "train").fingerprint(0)
+    seen = {before}
+    (root / "dataset.yaml").write_text("ego_mask: ego.png\n")
+    for rows in (10, 20):
+        mask = np.zeros((72, 128), np.uint8)
+        mask[-rows:] = 255
+        cv2.imwrite(str(root / "ego.png"), mask)
+        seen.add(DrivingDataset(root, "train").fingerprint(0))
+    assert len(seen) == 3
+    (root / "dataset.yaml").unlink()
+    assert DrivingDataset(root, "train").fingerprint(0) == before
 
 
 def test_of_two_ego_masks_that_fit_a_name_the_one_that_says_more_of_it_counts(root: Path) -> None:

@@ -5,10 +5,12 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import cv2
 import pytest
 
+from trilitenet.errors import BackendError
 from trilitenet.processing.cores import ProcessPool
 
 SCRIPT = """
@@ -62,6 +64,24 @@ def test_a_pool_works_and_tells_errors() -> None:
         assert list(pool.map(abs, [-1, 2, -3])) == [1, 2, 3]
         with pytest.raises(ValueError, match="invalid literal"):
             pool.submit(int, "x").result()
+
+
+def test_a_plain_script_needs_no_guard(tmp_path: Path) -> None:
+    script = tmp_path / "plain.py"
+    script.write_text(
+        "from trilitenet.processing.cores import ProcessPool\n"
+        "print('once')\n"
+        "with ProcessPool(2) as pool:\n"
+        "    print(list(pool.map(abs, [-1, 2])), __file__ == __import__('sys').argv[0], __spec__)\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True, timeout=60)
+    assert (done.stdout, done.stderr) == ("once\n[1, 2] True None\n", "")
+
+
+def test_a_process_that_is_killed_is_one_line() -> None:
+    message = r"was ended, mostly for want of memory; lower --workers$"
+    with pytest.raises(BackendError, match=message), ProcessPool(1) as pool:
+        pool.submit(os._exit, 9).result()
 
 
 def threads() -> int:

@@ -152,6 +152,7 @@ def _converted(type_: Any, tokens: Sequence[cyclopts.Token]) -> Any:
     return cyclopts.convert(type_, tokens)
 
 
+_SPLIT: Final = r"(train|val|valid|validation|test)([-_.]\w+)?"
 _LISTS: Final = {
     "--backend": "auto|torch|onnxruntime|openvino|ncnn|executorch|tensorrt",
     "--batch": r"\d+",
@@ -166,7 +167,7 @@ _LISTS: Final = {
     "--precisions": "fp32|fp16|bf16|int8",
     "--resolution": r"\d+",
     "--severities": r"\d+",
-    "--splits": r"(train|val|valid|validation|test)([-_.]\w+)?",
+    "--splits": rf"{_SPLIT}|[^-./\\][^./\\]*",
     "--tasks": "detection|drivable|lane",
     "--where": r"[\w.-]+=.+",
 }
@@ -179,8 +180,8 @@ def _repeated(words: Sequence[str]) -> list[str]:
     option = ""
     for word in words:
         further = bool(option) and re.fullmatch(_LISTS[option], word) is not None
-        if option in {"--by", "--classes"} and os.access(word, os.F_OK):  # any word may be an attribute or a class
-            further = False
+        if option in {"--by", "--classes", "--splits"} and os.access(word, os.F_OK):  # any word may be one of these
+            further = further and option == "--splits" and re.fullmatch(_SPLIT, word) is not None
         if further and spread[-1] != option:
             spread.append(option)
         elif not further:

@@ -119,7 +119,7 @@ def convert(
         kind: What the source is, if it is not the first word.
         classes: A YAML file with ``classes:`` (class name to categories), and for formats other than BDD100K what the
             other names and mask values mean; see docs/data.md.
-        splits: Convert these splits alone.
+        splits: Convert these splits alone. They come after OUTPUT.
         lane_width: Width of lane markings in pixels of a 1280-pixel wide image, for all splits (``4``) or one
             (``train=8``); 8 for train and 2 for others if left out. Markings that come as masks keep theirs.
         crosswalk: Draw crosswalks as lane markings.
@@ -389,7 +389,7 @@ def prepare(
         root: A data set in the published layout.
         output: Folder to write; ``.prepared`` in the data set if left out, where training finds it by itself.
         size: Height and width that training will use.
-        splits: Prepare these splits alone.
+        splits: Prepare these splits alone. They come after OUTPUT.
         classes: Detection classes, each of some box; those of the data set if left out. They come after OUTPUT.
         images: ``raw`` gives training exactly the same pixels, and is quickest; ``jpeg`` takes a sixth of the room.
         quality: Of the JPEGs, of 100.

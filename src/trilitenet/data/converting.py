@@ -687,7 +687,7 @@ def _finish(
         **{key: value for key, value in given if value != getattr(default, key)}
         | {
             "classes": dict(options.classes),
-            "ignore": options.ignore,
+            "ignore": (*options.ignore, *(category for category in before.ignore if category not in options.ignore)),
             "splits": tuple(sorted(split for split, count in report.images.items() if count)),
             "attributes": tuple(sorted(columns)),
             "drivable": _meaning(before.drivable, values, ignore),

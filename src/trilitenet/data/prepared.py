@@ -63,7 +63,7 @@ CACHE_FOLDER: Final = ".prepared"
 """A prepared copy in this folder of a data set is used by itself."""
 FORMAT: Final = 1
 
-_LAYOUT: Final = 2
+_LAYOUT: Final = 3
 """Shards of another layout are written anew."""
 
 _ENTRY: Final = frozenset({"name", "size", "boxes", "class_id", "ignored", "attributes", "parts"})
@@ -230,7 +230,7 @@ def open_dataset(
         return prepared
     cache = root / CACHE_FOLDER
     if canvas is not None and classes is None and is_prepared(cache):
-        state = _read_state(cache)
+        state = _read_state(cache / PREPARED_FILE)
         wanted = list(class_names or read_description(root).class_names)
         if state["canvas"] != list(canvas) or state["class_names"] != wanted or split not in state["splits"]:
             _LOGGER.info("%s: the prepared copy is for something else and is not used", root)
@@ -255,7 +255,7 @@ class PreparedDataset:
         split: The split.
         class_names: Must be those it was prepared with, if given.
         tasks: Read the labels of these alone.
-        cache: Where copies of remote shards go.
+        cache: Where copies of remote shards go, each state of a split into a folder of its own.
 
     Raises:
         DataError: If there is no such split, or the classes differ.
@@ -270,9 +270,8 @@ class PreparedDataset:
         tasks: Sequence[Task] | None = None,
         cache: str | Path | None = None,
     ) -> None:
-        self._place = _Place(str(root), None if cache is None else Path(cache))
+        self._place, state = _open_place(str(root), split, None if cache is None else Path(cache))
         self.split = split
-        state = _read_state(self._place.file(PREPARED_FILE).parent)
         self.canvas: tuple[int, int] = (state["canvas"][0], state["canvas"][1])
         self.mask_above: int = state["mask_above"]
         self._class_names = tuple(state["class_names"])
@@ -328,7 +327,7 @@ class PreparedDataset:
         return any(f"{task}.npy" in entry["parts"] for entry in entries)
 
     def fingerprint(self, index: int) -> str:
-        """Return a hash of what the shard's index says of a sample: boxes, attributes, and the size of its parts."""
+        """Return a hash of what the shard's index says of a sample: boxes, attributes, and the hash of its parts."""
         entry = self._entry(index)
         entry.pop("made_from", None)  # when the files of the shard were written, which a copy of them is not
         return hashlib.sha256(json.dumps(entry).encode()).hexdigest()[:16]
@@ -377,7 +376,7 @@ class PreparedDataset:
 
 @dataclasses.dataclass(frozen=True)
 class _Place:
-    """A folder, or the address of one whose files are copied when they are needed."""
+    """A folder, or the address of one whose files are copied to ``cache`` when they are needed."""
 
     root: str
     cache: Path | None
@@ -388,27 +387,49 @@ class _Place:
         Raises:
             DataError: If it is not there.
         """
-        if "://" not in self.root:
+        if self.cache is None:
             path = Path(self.root) / name
             if not path.is_file():
                 raise DataError(f"{path}: missing; make it with `trilitenet data prepare`")
             return path
-        if self.cache is None:
-            raise DataError(f"{self.root}: give `cache`, a folder for copies of remote shards")
         path = self.cache / name
         if not path.is_file():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            opener = import_extra("webdataset", "data").gopen
-            try:
-                with (
-                    replacing(path) as part,
-                    opener(f"{self.root.rstrip('/')}/{name}") as source,
-                    part.open("wb") as target,
-                ):
-                    shutil.copyfileobj(source, target)
-            except (OSError, ValueError) as error:
-                raise DataError(f"{self.root}/{name}: cannot be fetched ({error})") from error
+            _fetch(self.root, name, path)
         return path
+
+
+def _open_place(root: str, split: str, cache: Path | None) -> tuple[_Place, dict[str, Any]]:
+    """Return where a split's files are, and what ``prepared.json`` says.
+
+    What is remote is asked for ``prepared.json`` anew each time, so that no copies of another state, or of another data
+    set, are read; where it cannot be asked, the copies of its last state are.
+    """
+    if "://" not in root:
+        place = _Place(root, None)
+        return place, _read_state(place.file(PREPARED_FILE))
+    if cache is None:
+        raise DataError(f"{root}: give `cache`, a folder for copies of remote shards")
+    path = cache / f"{hashlib.sha256(root.encode()).hexdigest()[:16]}.json"
+    try:
+        _fetch(root, PREPARED_FILE, path)
+    except DataError as error:
+        if not path.is_file():
+            raise
+        _LOGGER.warning("%s; going on with the copies of it in %s", error, cache)
+    state = _read_state(path)
+    key = json.dumps([root, state["splits"].get(split), state["canvas"], state["class_names"], state["mask_above"]])
+    folder = f"{split}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+    return _Place(root, cache / folder), state
+
+
+def _fetch(root: str, name: str, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    opener = import_extra("webdataset", "data").gopen
+    try:
+        with replacing(path) as part, opener(f"{root.rstrip('/')}/{name}") as source, part.open("wb") as target:
+            shutil.copyfileobj(source, target)
+    except (OSError, ValueError) as error:
+        raise DataError(f"{root}/{name}: cannot be fetched ({error})") from error
 
 
 def _parse_entry(line: bytes, name: str) -> dict[str, Any]:
@@ -542,9 +563,10 @@ def _encode(sample: Sample, plan: _Plan) -> tuple[dict[str, bytes], dict[str, An
         "class_names": plan.class_names,
         "attributes": sample.attributes,
     }
+    digest = hashlib.sha256(b"".join(hashlib.sha256(data).digest() for data in members.values())).hexdigest()[:16]
     members["json"] = json.dumps(labels).encode()
     del labels["class_names"]
-    return members, labels
+    return members, {**labels, "digest": digest}
 
 
 def _locate(path: Path, entries: list[dict[str, Any]]) -> None:
@@ -607,7 +629,7 @@ def _check(canvas: tuple[int, int], quality: int, mask_above: int, shard_size: i
 def _open_out(plan: _Plan) -> None:
     state = plan.out / PREPARED_FILE
     if state.is_file():
-        there = _read_state(plan.out)
+        there = _read_state(plan.out / PREPARED_FILE)
         if {key: there.get(key) for key in _settings(plan)} != _settings(plan):
             raise OutputError(f"{plan.out}: was prepared with other settings; remove it or choose another folder")
     elif plan.out.is_dir() and any(plan.out.iterdir()):
@@ -619,7 +641,7 @@ def _open_out(plan: _Plan) -> None:
 
 def _forget(plan: _Plan, splits: Iterable[str]) -> None:
     """Take splits whose shards may be written again out of the state, so that nobody reads a mixture."""
-    there = _read_state(plan.out)
+    there = _read_state(plan.out / PREPARED_FILE)
     for split in splits:
         for part in ("splits", "shards", "counts"):
             there[part].pop(split, None)
@@ -627,7 +649,7 @@ def _forget(plan: _Plan, splits: Iterable[str]) -> None:
 
 
 def _write_state(plan: _Plan, datasets: Mapping[str, SampleSource]) -> None:
-    there = _read_state(plan.out)
+    there = _read_state(plan.out / PREPARED_FILE)
     for split, dataset in datasets.items():
         there["splits"][split] = _fingerprint(plan.root, split)
         there["counts"][split] = len(dataset)
@@ -651,9 +673,8 @@ def _replace_state(plan: _Plan, state: Mapping[str, Any]) -> None:
         part.write_text(text, encoding="utf-8")
 
 
-def _read_state(folder: Path) -> dict[str, Any]:
-    path = folder / PREPARED_FILE
-    cure = f"remove {folder} and prepare the data set again"
+def _read_state(path: Path) -> dict[str, Any]:
+    cure = f"remove {path.parent} and prepare the data set again"
     try:
         state: dict[str, Any] = parse_json(path.read_bytes())
     except (OSError, ValueError) as error:

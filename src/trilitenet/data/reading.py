@@ -190,7 +190,7 @@ def parse_annotation(
     try:
         for frame in content["frames"]:
             for item in frame.get("objects") or ():
-                category = item["category"]
+                category = str(item["category"])
                 box = item.get("box2d")
                 if box is None:
                     continue
@@ -311,7 +311,9 @@ class DrivingDataset:
         name, about = self.names[index], self.description
         meaning = (self._table, about.ignore, self._tasks, about.drivable, about.lane)
         digest = hashlib.sha256(repr(meaning).encode())
-        for path in (self.image_path(index), *(self.label_path(task, name) for task in LABEL_FILES)):
+        files = [self.image_path(index), *(self.label_path(task, name) for task in LABEL_FILES)]
+        files += filter(None, [self._ego_path(name)])
+        for path in files:
             data = _bytes_of(path)
             digest.update(b"-" if data is None else hashlib.sha256(data.tobytes()).digest())
         return digest.hexdigest()[:16]
@@ -426,11 +428,15 @@ class DrivingDataset:
             raise DataError(f"{path}: mask of {mask.shape[1]}x{mask.shape[0]} for an image of {size[1]}x{size[0]}")
         return mask, valid
 
-    def _ego(self, name: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+    def _ego_path(self, name: str) -> Path | None:
         masks = self.description.ego_masks
         path = next((masks[prefix] for prefix in sorted(masks, key=len, reverse=True) if name.startswith(prefix)), None)
         path = path or self.description.ego_mask
-        return None if path is None else _ego_mask(self.root / path, size)
+        return None if path is None else self.root / path
+
+    def _ego(self, name: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+        path = self._ego_path(name)
+        return None if path is None else _ego_mask(path, size)
 
 
 class MixedDataset:

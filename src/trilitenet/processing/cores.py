@@ -9,13 +9,17 @@ import os
 import platform
 import re
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, TypeVar
 
 import cv2
+
+from trilitenet.errors import BackendError
 
 __all__ = ["ProcessPool", "held_back", "processor", "usable_cores"]
 
@@ -42,7 +46,8 @@ class ProcessPool(concurrent.futures.ProcessPoolExecutor):
     """Processes that Ctrl-C in the terminal, which reaches all of them, ends without a word.
 
     What a process is at is interrupted, so that it cleans up; what waits is forgotten. Processes whose own was killed
-    end, too. OpenCV takes one thread in each.
+    end, too. OpenCV takes one thread in each. They do not run the caller's script again, which need not be guarded by
+    ``if __name__ == "__main__"``; so functions and classes of the script itself cannot be handed over.
 
     Args:
         workers: How many.
@@ -63,13 +68,30 @@ class ProcessPool(concurrent.futures.ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> concurrent.futures.Future[T]:
         """Add a task."""
-        with held_back(signal.SIGINT):  # in a process that starts with this task, too, until it can do without a word
+        # A process that starts with this task holds SIGINT back, too, until it can do without a word.
+        with held_back(signal.SIGINT), _script_unseen():
             return super().submit(_interruptible, fn, *args, **kwargs)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.shutdown(wait=True, cancel_futures=True)
+        if isinstance(error, BrokenProcessPool):
+            raise BackendError(
+                "a process that shared the work was ended, mostly for want of memory; lower --workers"
+            ) from error
+
+
+@contextlib.contextmanager
+def _script_unseen() -> Iterator[None]:
+    """Hide from processes that start in the block which script to run first: see `multiprocessing.spawn`."""
+    main = vars(sys.modules["__main__"])
+    hidden = {name: main.pop(name) for name in ("__file__", "__spec__") if name in main}
+    main["__spec__"] = None
+    try:
+        yield
+    finally:
+        main.update(hidden)
 
 
 @contextlib.contextmanager

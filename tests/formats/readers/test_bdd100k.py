@@ -14,6 +14,7 @@ from tests.formats.readers import raw_bdd
 from trilitenet.data.converting import ConversionOptions, convert
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.errors import DataError
+from trilitenet.formats.readers import bdd100k
 from trilitenet.formats.readers.bdd100k import parse_labels, read_bdd100k
 
 OPTIONS = ConversionOptions(lane_width={"*": raw_bdd.WIDTH_AT_1280}, max_gap=100.0)
@@ -216,6 +217,24 @@ def test_a_broken_document_is_counted_and_the_rest_converted(tmp_path: Path, con
     report = convert(read_bdd100k(raw), tmp_path / "out")
     assert report.images == {"train": 1, "val": 1}
     assert report.dropped["train"]["image: labels or image broken"] == 1
+
+
+def test_labels_that_the_first_documents_lack_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bdd100k, "_DOCUMENTS_LOOKED_AT", 1)
+    raw_bdd.write_images(tmp_path)
+    raw_bdd.write_2018_documents(tmp_path)
+    folder = tmp_path / "labels/100k/train"
+    content = json.loads((folder / "a1.json").read_text())
+    (folder / "a2.json").write_text(json.dumps(content | {"name": "a2"}))
+    items = content["frames"][0]["objects"]
+    content["frames"][0]["objects"] = [item for item in items if item["category"].startswith("area/")]
+    (folder / "a1.json").write_text(json.dumps(content))
+    source = read_bdd100k(tmp_path)
+    first, second = (source.record("train", name) for name in ("a1", "a2"))
+    assert (first.objects, first.lane) == (None, None)
+    assert len(second.objects or ()) == len(raw_bdd.boxes(raw_bdd.CATEGORIES_OLD))
+    assert second.drivable
+    assert second.lane
 
 
 @pytest.mark.parametrize("key", ["crowd", "ignored"])

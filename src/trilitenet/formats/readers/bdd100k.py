@@ -129,7 +129,10 @@ class BddSource:
             )
         merged = ImageRecord(name, files.images[name])
         for content, path in _entries(files, name):
-            tasks = files.tasks[files.documents if path.parent == files.documents else path]
+            if path.parent == files.documents:  # only the first few of these were looked at
+                tasks = files.tasks[path.parent] | _tasks_in(content)
+            else:
+                tasks = files.tasks[path]
             merged = _merge(merged, parse_labels(content, merged.image, str(path), tasks))
         if merged.drivable is None and files.drivable_masks is not None:
             folder, suffix, values = files.drivable_masks
