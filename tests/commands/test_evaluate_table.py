@@ -11,8 +11,10 @@ import pytest
 
 from tests.artefacts import Artefacts
 from trilitenet.commands import evaluate_table as command
+from trilitenet.commands.evaluate import evaluate
 from trilitenet.commands.evaluate_table import PrecisionRow, PrecisionTable, evaluate_table
 from trilitenet.data.synthetic_files import write_dataset
+from trilitenet.engine.report import read_report
 from trilitenet.errors import ConfigError, OutputError
 
 
@@ -108,6 +110,18 @@ def test_a_table_is_filled_and_what_is_done_is_kept(artefacts: Artefacts, tmp_pa
     evaluate_table(weights, precisions=("fp32",), **settings)  # type: ignore[arg-type]
     changed = {path.name for path in before if path.stat().st_mtime_ns != before[path]}
     assert changed == {"report.json", "report.html"}
+    # One that was measured otherwise is no row of the table.
+    artefact = next(path for path in before if path.name.endswith("fp32.onnx"))
+    folder = next(path.parent for path in before if path.name == "report.json" and "fp32" in path.parent.name)
+    wanted = evaluate_table(weights, precisions=("fp32",), **settings).summary()  # type: ignore[arg-type]
+    others: list[dict[str, Any]] = [{"protocol": "fair"}, {"paper_batch": 1}, {"lane": 0.9}, {"backend": "openvino"}]
+    for other in others:
+        options = {"protocol": "both", "backend": "onnxruntime", **other}
+        evaluate(str(artefact), data=data, output=folder, overwrite=True, resamples=0, worst=0, **options)
+        told = evaluate_table(weights, precisions=("fp32",), **settings)  # type: ignore[arg-type]
+        assert told.summary() == wanted, other
+        report = read_report(folder / "report.json")
+        assert (report.protocols, report.provenance.runtime) == (("fair", "paper"), "onnxruntime cpu fp32")
 
 
 def test_figures_without_a_value_are_dashes_and_hide_no_loss() -> None:

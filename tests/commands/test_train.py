@@ -14,7 +14,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +26,10 @@ import yaml
 import trilitenet
 from trilitenet.commands.train import _display, build_loss, train, training_data, validation_figures
 from trilitenet.commands.train_table import train_table
-from trilitenet.config import DEFAULT_ANCHORS, TASKS
+from trilitenet.config import DEFAULT_ANCHORS, TASKS, Task
 from trilitenet.data.description import read_description, write_description
 from trilitenet.data.loader import epoch_order
-from trilitenet.data.prepared import prepare
+from trilitenet.data.prepared import PreparedDataset, prepare
 from trilitenet.data.reading import DrivingDataset, MixedDataset
 from trilitenet.data.synthetic_files import write_dataset
 from trilitenet.engine import train as engine
@@ -572,6 +572,33 @@ def test_a_validation_without_labels_is_told_and_stops_nothing(
     assert "no image of val is labelled for lane" in caplog.text
 
 
+def test_the_optimiser_goes_on_as_this_device_computes(scenes: Path, tmp_path: Path) -> None:
+    train(**settings(scenes, tmp_path / "run", max_steps=1))
+    path = tmp_path / "run/last.ckpt"
+    state = torch.load(path, weights_only=True)
+    for group in state["optimiser"]["param_groups"]:
+        group.update(fused=False, foreach=True)  # as on Apple's GPUs
+    torch.save(state, path)
+    seen: list[Any] = []
+    plain = torch.optim.AdamW.step
+
+    def step(self: torch.optim.AdamW, *rest: Any, **more: Any) -> Any:
+        seen.extend((group["fused"], group["foreach"]) for group in self.param_groups)
+        return plain(self, *rest, **more)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.optim.AdamW, "step", step)
+        train(**settings(scenes, tmp_path / "run", max_steps=2), resume=True)
+    assert set(seen) == {(True, None)}
+
+
+def test_tasks_are_in_one_order_however_they_are_given(scenes: Path, tmp_path: Path) -> None:
+    assert TrainConfig(tasks=("lane", "drivable")).tasks == ("drivable", "lane")
+    train(**settings(scenes, tmp_path / "run", max_steps=1, tasks=("lane", "drivable")))
+    result = train(**settings(scenes, tmp_path / "run", max_steps=2, tasks=("drivable", "lane")), resume=True)
+    assert result.steps == 2
+
+
 def test_transfer_freeze_and_distil(scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = train(**settings(scenes, tmp_path / "teacher", max_steps=1))
     options = {"init": str(first.weights), "teacher": str(first.weights), "freeze": ("encoder",)}
@@ -584,13 +611,9 @@ def test_transfer_freeze_and_distil(scenes: Path, tmp_path: Path, capsys: pytest
     assert read_card(second.weights).provenance["teacher"] == "final.safetensors"
 
 
-def test_distils_from_saved_outputs(scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    images = tmp_path / "images-alone"
-    shutil.copytree(scenes / "images", images / "images")
-    dataset = DrivingDataset(scenes, "train")
-    assert len(dataset) == 10
-    teacher = tmp_path / "outputs"
-    with PredictionWriter(teacher, TASKS) as writer:
+def save_labels(folder: Path, dataset: DrivingDataset, tasks: Sequence[Task] = TASKS) -> Path:
+    """Save labels as a teacher's outputs, so that what is taught can be compared with them."""
+    with PredictionWriter(folder, tasks) as writer:
         for sample in dataset:
             assert sample.boxes is not None
             assert sample.class_id is not None
@@ -602,6 +625,62 @@ def test_distils_from_saved_outputs(scenes: Path, tmp_path: Path, capsys: pytest
                 sample.name,
                 Perception(size=sample.size, class_names=("vehicle",), boxes=said, drivable=drivable, lane=lane),
             )
+    return folder
+
+
+def test_a_task_that_is_neither_labelled_nor_taught_is_told(
+    scenes: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = tmp_path / "images-alone"
+    shutil.copytree(scenes / "images", images / "images")
+    boxes = save_labels(tmp_path / "boxes", DrivingDataset(scenes, "train"), ("detection",))
+    taught = settings(images, tmp_path / "run", max_steps=1, teacher=str(boxes))
+    train(**{**taught, "auto_anchor": True})
+    assert "no image of train is labelled for drivable, lane" in caplog.text
+    assert "anchors: kept as they are, for there is no labelled box" in capsys.readouterr().err
+    for none in ({"distillation": (0.0, 1.0, 1.0)}, {"teacher": "tiny", "distillation": (0.0, 0.0, 0.0)}):
+        with pytest.raises(DataError, match="no image of train is labelled for detection, drivable, lane"):
+            train(**{**taught, **none}, overwrite=True)
+    caplog.clear()
+    train(**{**taught, "teacher": "tiny"}, overwrite=True)
+    assert "labelled" not in caplog.text
+
+
+def test_boxes_alone_teach_a_data_set_that_has_a_prepared_copy(
+    scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = shutil.copytree(scenes, tmp_path / "data")
+    prepare(data, canvas=(64, 128), splits=["train"])
+    options = settings(data, tmp_path / "run", max_steps=1)
+    assert isinstance(training_data(TrainConfig(**{**options, "tasks": ("detection",)})), PreparedDataset)
+    boxes = save_labels(tmp_path / "boxes", DrivingDataset(scenes, "train"), ("detection",))
+    train(**options, teacher=str(boxes))
+    assert "taught detection on 8 of 10 images" in capsys.readouterr().err  # of two there is no box
+    with pytest.raises(ConfigError, match="boxes without masks do not tell the size"):
+        train(**{**options, "data": str(data / ".prepared")}, teacher=str(boxes), overwrite=True)
+
+
+def test_outputs_that_fit_no_one_image_are_refused(scenes: Path, tmp_path: Path) -> None:
+    teacher = save_labels(tmp_path / "outputs", DrivingDataset(scenes, "train"))
+    options = settings(scenes, tmp_path / "run", max_steps=1, teacher=str(teacher))
+    other = shutil.copytree(scenes, tmp_path / "other")
+    name = next(
+        sample.name for sample in DrivingDataset(scenes, "train") if sample.boxes is not None and len(sample.boxes)
+    )
+    with pytest.raises(ConfigError, match="several images of the training data are called "):
+        train(**options, extra_data={str(other): 1.0})
+    for task in ("drivable", "lane"):
+        (teacher / task / f"{name}.png").unlink()
+    with pytest.raises(DataError, match=f"has boxes of {name} but no mask of the image; every image needs a mask"):
+        train(**options)
+
+
+def test_distils_from_saved_outputs(scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    images = tmp_path / "images-alone"
+    shutil.copytree(scenes / "images", images / "images")
+    dataset = DrivingDataset(scenes, "train")
+    assert len(dataset) == 10
+    teacher = save_labels(tmp_path / "outputs", dataset)
     plain = logged(scenes, tmp_path / "labels", max_steps=2)
     train(**plain)
     taught = {**plain, "data": str(images), "output": str(tmp_path / "taught"), "teacher": str(teacher)}

@@ -129,10 +129,12 @@ def test_confidence_makes_objects_and_ignored_regions(tmp_path: Path) -> None:
         assert len(doubtful.ignored) == count
 
 
-def test_outputs_follow_a_smaller_image(tmp_path: Path) -> None:
+@pytest.mark.parametrize("above", [1, 127])
+@pytest.mark.parametrize("canvas", [(64, 96), (192, 320)])
+def test_outputs_follow_a_resized_image_as_labels_do(canvas: tuple[int, int], above: int, tmp_path: Path) -> None:
     sample = scene()
-    small = shrink(sample, (64, 96), 127)
-    said = Lessons(save(tmp_path, sample), ("vehicle",), resized=True).of(bare(small))
+    small = shrink(sample, canvas, above)
+    said = Lessons(save(tmp_path, sample), ("vehicle",), resized=True, mask_above=above).of(bare(small))
     assert said is not None
     assert said.boxes is not None
     assert small.boxes is not None

@@ -5,17 +5,17 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from trilitenet.commands.load import load
 from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, one_for_several, optional_path
 from trilitenet.commands.progress import show_progress
-from trilitenet.config import ArtefactInfo, Task, shipped_weights
+from trilitenet.config import ArtefactInfo, ModelCard, Task, shipped_weights
 from trilitenet.data.reading import DrivingDataset
-from trilitenet.engine.evaluate import EvaluatedPredictor
+from trilitenet.engine.evaluate import LOWEST_CONFIDENCE, EvaluatedPredictor
 from trilitenet.engine.evaluate import evaluate as run_evaluation
 from trilitenet.engine.predictions import PredictionWriter
 from trilitenet.engine.provenance import hash_files
@@ -26,7 +26,9 @@ from trilitenet.errors import ConfigError, DataError, OutputError
 from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.corruptions import SEVERITIES
 
-__all__ = ["evaluate", "hash_dataset", "hash_model", "write_report"]
+__all__ = ["evaluate", "hash_dataset", "hash_model", "known_report", "write_report"]
+
+_PAPER_BATCH: Final = 16
 
 
 @one_for_several
@@ -44,7 +46,7 @@ def evaluate(
     resamples: int = 1000,
     worst: int = 24,
     by: Sequence[str] = CONDITIONS,
-    paper_batch: int = 16,
+    paper_batch: int = _PAPER_BATCH,
     batch_size: int = 1,
     network: str | None = None,
     device: str = "auto",
@@ -227,13 +229,26 @@ def hash_dataset(dataset: DrivingDataset, limit: int | None = None) -> dict[str,
     }
 
 
-def known_report(folder: Path, model: str, data_hash: Callable[[], dict[str, str]]) -> Report | None:
-    """Return the report that is in a folder, if it is of this model's file and of these images and labels.
+def known_report(
+    folder: Path,
+    model: str,
+    data_hash: Callable[[], dict[str, str]],
+    *,
+    card: ModelCard,
+    protocols: Collection[str],
+    backend: str,
+    long_side: int | None = None,
+) -> Report | None:
+    """Return the report that is in a folder, if `evaluate` would say the same of this model and data again.
 
     Args:
         folder: The folder.
         model: The file.
         data_hash: Gives what `hash_dataset` does; called for a report of this file alone.
+        card: Of the model, with whose thresholds it shall have been measured.
+        protocols: Those that are needed, in batches of the published size.
+        backend: The runtime that it shall have run on; torch is the plain network.
+        long_side: The longer side of its input; the card's if left out.
     """
     path = folder / "report.json"
     if not path.is_file():
@@ -242,7 +257,19 @@ def known_report(folder: Path, model: str, data_hash: Callable[[], dict[str, str
         report = read_report(path)
     except DataError:  # then it is made anew
         return None
-    same = report.provenance.model_sha256 == hash_model(model) and report.provenance.data_sha256 == data_hash()
+    about = report.provenance
+    runtime = about.runtime.split()
+    side = max(card.input_size) if long_side is None else long_side
+    same = (
+        set(protocols) <= set(report.protocols)
+        and ("paper" not in protocols or about.settings.get("paper_batch") == _PAPER_BATCH)
+        and about.settings.get("lowest_confidence") == LOWEST_CONFIDENCE
+        and about.thresholds == dataclasses.asdict(card.thresholds)
+        and all(max(map(int, size.split("x"))) == side for size in about.canvas)
+        and (runtime[:1] == [backend] and (backend != "torch" or "graph" not in runtime))
+        and about.model_sha256 == hash_model(model)
+        and about.data_sha256 == data_hash()
+    )
     return report if same else None
 
 

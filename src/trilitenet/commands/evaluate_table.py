@@ -69,7 +69,9 @@ class PrecisionTable:
         """Return by how many points a row is at most below the first row of its model, and in which figure."""
         first = self._first(row)
         lost = {
-            key: 100 * (first.figures[key] - row.figures[key]) for key in (*PAPER_COLUMNS, *_FAIR) if key in row.figures
+            key: 100 * (first.figures.get(key, math.nan) - row.figures[key])
+            for key in (*PAPER_COLUMNS, *_FAIR)
+            if key in row.figures
         }
         lost = {key: value for key, value in lost.items() if not math.isnan(value)}  # as for a task without labels
         worst = max(lost, key=lambda key: lost[key], default="")
@@ -97,7 +99,7 @@ class PrecisionTable:
                 if math.isnan(value):
                     cells.append("-")
                     continue
-                points = 100 * (value - first.figures[key])
+                points = 100 * (value - first.figures.get(key, math.nan))
                 cells.append(f"{100 * value:.2f}" + ("" if row is first else f" ({points:+.2f})"))
             lines.append(markdown_row((row.model, row.precision, row.runtime, *cells)))
         return lines
@@ -170,7 +172,8 @@ def evaluate_table(
     rows: list[PrecisionRow] = []
     hashes: dict[tuple[str, ...], dict[str, str]] = {}  # the classes decide what labels mean
     for model in [os.fspath(model) for model in models or VARIANTS]:
-        classes = read_card(model).class_names
+        card = read_card(model)
+        classes = card.class_names
         if classes not in hashes:
             hashes[classes] = hash_dataset(DrivingDataset(data, split, class_names=classes), limit)
         stamp = (hash_model(model) or "")[:12]
@@ -180,9 +183,18 @@ def evaluate_table(
             folder = output / (name if format == "openvino" else f"{name}-{format}")
             files = [artefact, *([artefact.with_suffix(".bin")] if format == "openvino" else [])]
             made = not overwrite and all(file.is_file() for file in files)
-            report = (
-                known_report(folder, str(artefact), functools.partial(hashes.__getitem__, classes)) if made else None
-            )
+            runtime = "openvino" if format == "openvino" else "onnxruntime"
+            report = None
+            if made:
+                report = known_report(
+                    folder,
+                    str(artefact),
+                    functools.partial(hashes.__getitem__, classes),
+                    card=card,
+                    protocols=("paper", "fair"),
+                    backend=runtime,
+                    long_side=None if size == "dynamic" else max(map(int, size.split("x"))),
+                )
             if report is None:
                 stage = f"{model} {precision} ({len(rows) + 1} of {len(models or VARIANTS) * len(precisions)})"
                 if not made:
@@ -207,7 +219,7 @@ def evaluate_table(
                     data=data,
                     split=split,
                     protocol="both",
-                    backend="openvino" if format == "openvino" else "onnxruntime",
+                    backend=runtime,
                     output=folder,
                     resamples=0,
                     worst=0,

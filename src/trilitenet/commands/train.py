@@ -11,7 +11,8 @@ import logging
 import math
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, get_type_hints
 
@@ -33,7 +34,7 @@ from rich.table import Column
 from trilitenet.commands.load import own_builder
 from trilitenet.commands.paths import StrPath, optional_path
 from trilitenet.commands.progress import show_bars
-from trilitenet.config import DEFAULT_ANCHORS, ModelCard, parse_yaml
+from trilitenet.config import DEFAULT_ANCHORS, TASKS, ModelCard, Task, parse_yaml
 from trilitenet.data.contact_sheet import as_perception
 from trilitenet.data.description import folder_name
 from trilitenet.data.identity import identify, parts_of
@@ -45,6 +46,7 @@ from trilitenet.engine.anchors import box_sizes, fit_anchors
 from trilitenet.engine.evaluate import evaluate
 from trilitenet.engine.lessons import Lessons, TaughtTransform
 from trilitenet.engine.loggers import build_loggers, check_loggers
+from trilitenet.engine.predictions import saved_tasks
 from trilitenet.engine.recipe import TrainConfig, merge, read_recipe
 from trilitenet.engine.results import write_results
 from trilitenet.engine.runtime import follow, running_fabric
@@ -59,7 +61,7 @@ from trilitenet.losses.multitask import MultiTaskLoss
 from trilitenet.losses.segmentation import SegmentationLoss
 from trilitenet.models.builders import build_by
 from trilitenet.models.trilitenet import TriLiteNet
-from trilitenet.models.weights import load_network
+from trilitenet.models.weights import load_network, read_card
 
 __all__ = ["build_loss", "train", "training_data", "validation_figures"]
 
@@ -199,8 +201,14 @@ def _take_part() -> None:
 
 def training_data(config: TrainConfig) -> SampleSource:
     """Open the data that a recipe trains on."""
+    # A folder of boxes alone does not tell the size of the images they are for: these are read, not a prepared copy.
+    folder = None if config.teacher is None else Path(config.teacher)
+    boxes_alone = folder is not None and folder.is_dir() and saved_tasks(folder) == ("detection",)
     opened = functools.partial(
-        open_dataset, split=config.train_split, canvas=config.input_size, mask_above=config.augmentation.mask_above
+        open_dataset,
+        split=config.train_split,
+        canvas=None if boxes_alone else config.input_size,
+        mask_above=config.augmentation.mask_above,
     )
     first = opened(config.data, class_names=config.classes)
     if not config.extra_data:
@@ -213,15 +221,14 @@ def _check_labels(config: TrainConfig, dataset: SampleSource, display: _Display)
     """Warn of tasks that no image is labelled for, of classes that no box is of, and of those that are not learnt.
 
     Raises:
-        DataError: If there are no labels at all, and no teacher.
+        DataError: If there are no labels at all, and no teacher of any of the tasks.
     """
     parts = list(parts_of(dataset))
-    if config.teacher is None:
-        reason, tasks = _unlabelled(config, config.train_split, parts)
-        if tasks == len(config.tasks):
-            raise DataError(reason)
-        if tasks:
-            _LOGGER.warning(reason)
+    reason, tasks = _unlabelled(config, config.train_split, parts, _taught(config))
+    if tasks == len(config.tasks):
+        raise DataError(reason)
+    if tasks:
+        _LOGGER.warning(reason)
     if "detection" in config.tasks:
         for part in parts:
             if isinstance(part, DrivingDataset):
@@ -235,9 +242,30 @@ def _check_labels(config: TrainConfig, dataset: SampleSource, display: _Display)
                     )
 
 
-def _unlabelled(config: TrainConfig, split: str, parts: Sequence[DrivingDataset | PreparedDataset]) -> tuple[str, int]:
-    """Return which tasks no image of a split is labelled for, in words, and how many they are."""
-    without = [task for task in config.tasks if not any(part.has_labels(task) for part in parts)]
+def _taught(config: TrainConfig) -> frozenset[Task]:
+    """Return the tasks that a teacher teaches.
+
+    Raises:
+        ConfigError: If it has none of those that are trained.
+    """
+    if config.teacher is None:
+        return frozenset()
+    folder = Path(config.teacher)
+    tasks = saved_tasks(folder) if folder.is_dir() else read_card(config.teacher).tasks
+    if not set(tasks) & set(config.tasks):
+        raise ConfigError(f"{config.teacher}: the teacher has none of the tasks {', '.join(config.tasks)}")
+    return frozenset(task for task, weight in zip(TASKS, config.distillation, strict=True) if weight and task in tasks)
+
+
+def _unlabelled(
+    config: TrainConfig,
+    split: str,
+    parts: Sequence[DrivingDataset | PreparedDataset],
+    taught: Collection[Task] = (),
+) -> tuple[str, int]:
+    """Return which tasks no image of a split is labelled for nor taught, in words, and how many they are."""
+    untaught = [task for task in config.tasks if task not in taught]
+    without = [task for task in untaught if not any(part.has_labels(task) for part in parts)]
     return f"{config.data}: no image of {split} is labelled for {', '.join(without)}", len(without)
 
 
@@ -252,11 +280,21 @@ def _transform(config: TrainConfig, dataset: SampleSource, display: _Display) ->
         dataset.class_names,
         config.teacher_confidence,
         resized=any(isinstance(part, PreparedDataset) for part in parts),
+        mask_above=config.augmentation.mask_above,
     )
-    if not set(lessons.tasks) & set(config.tasks):
-        raise ConfigError(f"{config.teacher}: the teacher has none of the tasks {', '.join(config.tasks)}")
-    names = {name for part in parts for name in part.names}
-    taught = len(names & lessons.names())
+    count = Counter(name for part in parts for name in part.names)
+    names, known = count.keys(), lessons.names()
+    if twice := sorted(name for name in names & known if count[name] > 1):
+        raise ConfigError(
+            f"{config.teacher}: outputs are found by the image's name, and several images of the training data are "
+            f"called {few(twice)}; give the images names of their own"
+        )
+    if unmasked := sorted(lessons.unmasked() & names):
+        raise DataError(
+            f"{config.teacher}: has boxes of {few(unmasked)} but no mask of the image; every image needs a mask (an "
+            "empty one where nothing is predicted), or no image any"
+        )
+    taught = len(names & known)
     if not taught:
         raise ConfigError(f"{config.teacher}: none of the {len(names)} training images is among the saved outputs")
     display.line(f"{config.teacher}: taught {', '.join(lessons.tasks)} on {taught} of {len(names)} images")
@@ -275,9 +313,12 @@ def _network(config: TrainConfig, dataset: SampleSource, display: _Display, *, r
         enough = math.inf if swapped else config.anchor_recall
         # Weights that are taken over were trained with anchors of their own: those are kept where they fit.
         before = DEFAULT_ANCHORS if initial is None or "detection" not in initial.tasks else initial.card.anchors
-        fit = fit_anchors(sizes, before, enough=enough, seed=config.seed)
-        display.line(fit.summary())
-        anchors = fit.anchors
+        if len(sizes) or "detection" not in _taught(config):
+            fit = fit_anchors(sizes, before, enough=enough, seed=config.seed)
+            display.line(fit.summary())
+            anchors = fit.anchors
+        else:
+            display.line("anchors: kept as they are, for there is no labelled box to fit them to")
     network = build_by(
         config.network,
         config.variant,
@@ -337,8 +378,6 @@ def _teacher(config: TrainConfig, network: TriLiteNet) -> tuple[TriLiteNet, Dist
     if config.teacher is None or Path(config.teacher).is_dir():
         return None
     teacher = load_network(config.teacher, own_builder(config.teacher, config.network))
-    if not set(teacher.tasks) & set(network.tasks):
-        raise ConfigError(f"{config.teacher}: the teacher has none of the tasks {', '.join(network.tasks)}")
     told, wanted = teacher.card.class_names, network.card.class_names
     if "detection" in teacher.tasks and "detection" in network.tasks and told != wanted and config.distillation[0]:
         raise ConfigError(

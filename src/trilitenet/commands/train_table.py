@@ -150,7 +150,15 @@ def _measure(weights: Path, network: TriLiteNet, config: TrainConfig) -> dict[st
         return {}
     dataset = DrivingDataset(config.data, config.val_split, class_names=network.card.class_names)
     folder = weights.parent / _REPORT
-    report = known_report(folder, str(weights), lambda: hash_dataset(dataset)) or evaluate(
+    known = known_report(
+        folder,
+        str(weights),
+        lambda: hash_dataset(dataset),
+        card=network.card,
+        protocols=("paper",),
+        backend="torch",
+    )
+    report = known or evaluate(
         str(weights),
         network=config.network,
         data=Path(config.data),

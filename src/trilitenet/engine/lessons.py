@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -22,12 +21,11 @@ from trilitenet.data.sample import Sample
 from trilitenet.data.transforms import Transform
 from trilitenet.engine.predictions import SavedPredictions
 from trilitenet.errors import ConfigError, DataError
+from trilitenet.processing.letterbox import Letterbox
 from trilitenet.structures import Perception
 
 __all__ = ["Lessons", "TaughtTransform"]
 
-_HALF: Final = 127
-"""An area-resized mask pixel (0 to 255) above this is foreground, which keeps a mask's area."""
 _FIELDS: Final[dict[Task, tuple[str, ...]]] = {
     "detection": ("boxes", "class_id"),
     "drivable": ("drivable",),
@@ -44,7 +42,8 @@ class Lessons:
         class_names: Detection classes of the data set, in the teacher's order of categories.
         confidence: (low, high): a box scored at least ``high`` is an object, one between is an ignored region, one
             below ``low`` is left out.
-        resized: Whether samples may be smaller than the images that the teacher saw, as prepared ones are.
+        resized: Whether samples may be of another size than the images that the teacher saw, as prepared ones are.
+        mask_above: A pixel of a mask that is resized with its image is foreground above this, of 255, as of a label.
 
     Raises:
         ConfigError: If samples are resized and no mask tells from what size.
@@ -58,8 +57,10 @@ class Lessons:
         confidence: tuple[float, float] = (0.1, 0.5),
         *,
         resized: bool = False,
+        mask_above: int = 1,
     ) -> None:
         self._saved = SavedPredictions(folder, class_names)
+        self._mask_above = mask_above
         self._low, self._high = confidence
         if resized and self._saved.tasks == ("detection",):
             raise ConfigError(
@@ -74,8 +75,14 @@ class Lessons:
 
     def names(self) -> set[str]:
         """Return the images that the teacher said something of."""
-        masks = (path.stem for task in ("drivable", "lane") for path in (self._saved.folder / task).glob("*.png"))
-        return set(self._saved.names).union(masks)
+        return set(self._saved.names) | self._masked()
+
+    def unmasked(self) -> set[str]:
+        """Return the images that have boxes and no mask, of a teacher that has masks: nothing tells their size."""
+        return set(self._saved.names) - self._masked() if {"drivable", "lane"} & set(self.tasks) else set()
+
+    def _masked(self) -> set[str]:
+        return {path.stem for task in ("drivable", "lane") for path in (self._saved.folder / task).glob("*.png")}
 
     def of(self, sample: Sample, wanted: Sequence[Task] = TASKS) -> Sample | None:
         """Return the sample with the teacher's outputs as its only labels; None if the teacher never saw it.
@@ -104,9 +111,15 @@ class Lessons:
             boxes=boxes,
             class_id=class_id,
             ignored=doubtful,
-            drivable=_resized(said.drivable, sample.size),
-            lane=_resized(said.lane, sample.size),
+            drivable=self._resized(said.drivable, sample.size),
+            lane=self._resized(said.lane, sample.size),
         )
+
+    def _resized(self, mask: NDArray[np.bool_] | None, size: tuple[int, int]) -> NDArray[np.uint8] | None:
+        """Return a mask of {0, 1} at a size, made as labels of that size are."""
+        if mask is None or mask.shape == size:
+            return None if mask is None else mask.astype(np.uint8)
+        return Letterbox((mask.shape[0], mask.shape[1]), size, size, 0, 0).mask(mask, self._mask_above)
 
     def _boxes(
         self, said: Perception, scale: tuple[float, float]
@@ -181,14 +194,3 @@ def _png_size(path: Path) -> tuple[int, int]:
             return image.height, image.width
     except (OSError, Image.DecompressionBombError) as error:
         raise DataError(f"{path}: not a PNG image") from error
-
-
-def _resized(mask: NDArray[np.bool_] | None, size: tuple[int, int]) -> NDArray[np.uint8] | None:
-    """Return a mask of {0, 1} at a size."""
-    if mask is None:
-        return None
-    grey = mask.astype(np.uint8)
-    if mask.shape == size:
-        return grey
-    shrunk = cv2.resize(grey * 255, size[::-1], interpolation=cv2.INTER_AREA)
-    return np.asarray(shrunk > _HALF, np.uint8)

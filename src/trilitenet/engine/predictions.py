@@ -35,7 +35,7 @@ from trilitenet.data.reading import decode
 from trilitenet.errors import DataError, OutputError, brief, part_of, write_file, writing
 from trilitenet.structures import Boxes, Perception
 
-__all__ = ["DETECTIONS_FILE", "PredictionWriter", "SavedPredictions"]
+__all__ = ["DETECTIONS_FILE", "PredictionWriter", "SavedPredictions", "saved_tasks"]
 
 _LOGGER: Final = logging.getLogger(__name__)
 
@@ -140,6 +140,22 @@ class PredictionWriter:
                 part_of(path).replace(path)
 
 
+def saved_tasks(folder: Path) -> tuple[Task, ...]:
+    """Return the tasks that a folder holds predictions of.
+
+    Raises:
+        DataError: If there are none.
+    """
+    present = {
+        "detection": (folder / DETECTIONS_FILE).is_file(),
+        "drivable": (folder / "drivable").is_dir(),
+        "lane": (folder / "lane").is_dir(),
+    }
+    if not any(present.values()):
+        raise DataError(f"{folder}: no predictions; expected {DETECTIONS_FILE}, drivable/NAME.png or lane/NAME.png")
+    return tuple(task for task in TASKS if present[task])
+
+
 class SavedPredictions:
     """Predictions read from disk.
 
@@ -154,16 +170,9 @@ class SavedPredictions:
     def __init__(self, folder: Path, class_names: Sequence[str]) -> None:
         self.folder = folder
         self.class_names = tuple(class_names)
-        present = {
-            "detection": (folder / DETECTIONS_FILE).is_file(),
-            "drivable": (folder / "drivable").is_dir(),
-            "lane": (folder / "lane").is_dir(),
-        }
-        self.tasks: tuple[Task, ...] = tuple(task for task in TASKS if present[task])
-        if not self.tasks:
-            raise DataError(f"{folder}: no predictions; expected {DETECTIONS_FILE}, drivable/NAME.png or lane/NAME.png")
+        self.tasks = saved_tasks(folder)
         self._boxes: dict[str, Boxes] = {}
-        if present["detection"]:
+        if "detection" in self.tasks:
             self._check_classes(folder / _CLASSES_FILE)
             self._boxes = self._read_detections(folder / DETECTIONS_FILE)
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from trilitenet.config import TASKS, Anchors, Task, check_anchors, get_variant, parse, plain, read_yaml
+from trilitenet.config import TASKS, Anchors, Task, check_anchors, check_tasks, get_variant, parse, plain, read_yaml
 from trilitenet.data.transforms import Augmentation
 from trilitenet.errors import ConfigError
 
@@ -204,6 +204,7 @@ class TrainConfig:
             check_anchors(self.anchors)
         if not 0 <= self.ema_decay < 1:
             raise ConfigError(f"ema_decay must be in [0, 1), got {self.ema_decay}")
+        object.__setattr__(self, "tasks", check_tasks(self.tasks))  # in one order, as networks have them
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists, numbers and strings, as YAML and checkpoints hold them."""

@@ -72,6 +72,8 @@ SAME_ON_RESUME: Final = (
     "decay_all",
 )
 """Settings that a checkpoint must share with the run that resumes it."""
+_OF_THE_RUN: Final = ("weight_decay", "betas", "fused", "foreach")
+"""Settings of the optimiser that are the run's, not its checkpoint's."""
 
 
 class BatchSource(Protocol):
@@ -635,10 +637,12 @@ class Trainer:
         if self.ema is not None:
             # A run without an average that goes on with one: it begins at the weights as they are.
             self.ema.load_state_dict(state["ema"] or {"updates": 0, "network": state["network"]})
-        settings = [(group["weight_decay"], group["betas"]) for group in self.optimiser.param_groups]
-        self.optimiser.load_state_dict(state["optimiser"])
-        for group, (weight_decay, betas) in zip(self.optimiser.param_groups, settings, strict=True):
-            group.update(weight_decay=weight_decay, betas=betas)  # as this run says, like the learning rate
+        # As this run says, like the learning rate, and as this device computes; before they are loaded, for where a
+        # fused optimiser keeps its counts of steps depends on it.
+        now = [{key: group[key] for key in _OF_THE_RUN} for group in self.optimiser.param_groups]
+        before = state["optimiser"]["param_groups"]
+        groups = [{**old, **new} for old, new in zip(before, now, strict=True)]
+        self.optimiser.load_state_dict({**state["optimiser"], "param_groups": groups})
         self.loss.load_state_dict(state["loss"])
         if state["scaler"]:
             self.fabric._precision.load_state_dict(state["scaler"])

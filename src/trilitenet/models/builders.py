@@ -19,7 +19,7 @@ from typing import Any, Final, TypeAlias
 
 import torch
 
-from trilitenet.config import STRIDES
+from trilitenet.config import STRIDES, check_tasks
 from trilitenet.errors import ConfigError, TriLiteNetError, did_you_mean, gist
 from trilitenet.models.trilitenet import NetworkOutputs, TriLiteNet, build_network
 
@@ -69,7 +69,8 @@ def build_by(
         network = function(variant, classes, tasks, **options)
     if not isinstance(network, TriLiteNet):
         raise ConfigError(f"{name}: returned {type(network).__name__}, not a TriLiteNet; begin with build_network")
-    if (network.classes, network.tasks) != (classes, tuple(tasks)):
+    tasks = check_tasks(tuple(tasks))
+    if (network.classes, network.tasks) != (classes, tasks):
         raise ConfigError(
             f"{name}: built {network.classes} classes and {', '.join(network.tasks)}, asked for were {classes} and "
             f"{', '.join(tasks)}; hand on what it is called with"

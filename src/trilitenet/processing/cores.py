@@ -86,7 +86,7 @@ class ProcessPool(concurrent.futures.ProcessPoolExecutor):
 def _script_unseen() -> Iterator[None]:
     """Hide from processes that start in the block which script to run first: see `multiprocessing.spawn`."""
     main = vars(sys.modules["__main__"])
-    hidden = {name: main.pop(name) for name in ("__file__", "__spec__") if name in main}
+    hidden: dict[str, Any] = {name: main.pop(name) for name in ("__file__", "__spec__") if name in main}
     main["__spec__"] = None
     try:
         yield
