@@ -20,6 +20,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import openvino as ov
 import torch
@@ -118,6 +119,9 @@ def measure(weights: str, arguments: argparse.Namespace, folder: Path) -> dict[s
     proto = build_onnx(DeployGraph(network, auto), network.card, info)
     deploy = build_openvino(proto)
     threads = arguments.threads
+    if threads is not None:
+        torch.set_num_threads(threads)
+        cv2.setNumThreads(threads)
     image = SyntheticScenes(0, (720, 1280))[0].image if arguments.image is None else read_image(arguments.image)
 
     calls: dict[str, Callable[[], object]] = {}
@@ -142,8 +146,8 @@ def measure(weights: str, arguments: argparse.Namespace, folder: Path) -> dict[s
         data = build_onnx(DeployGraph(network, layout), network.card, info).SerializeToString()
         calls["deploy onnxruntime fp32"] = onnxruntime_call(data, threads)
     if arguments.streams:
-        calls[PLAIN_STREAMS] = openvino_call(plain_model, OWN, None, 2)
-        calls[f"deploy openvino {OWN}, 8 frames on 2 streams"] = openvino_call(deploy, OWN, None, 2)
+        calls[PLAIN_STREAMS] = openvino_call(plain_model, OWN, threads, 2)
+        calls[f"deploy openvino {OWN}, 8 frames on 2 streams"] = openvino_call(deploy, OWN, threads, 2)
     if arguments.frame:
         big = DeployGraph(network, auto, mask_scale=2, thresholds=Thresholds())
         path = folder / f"{variant}.xml"

@@ -5,7 +5,7 @@ import sys
 import time
 from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
@@ -215,25 +215,27 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
 
 
 def test_figures_by_hand(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
-    backend = Taking(watch, [700, 9000, 9000, *range(100, 201)])  # the first, two to warm up, 100 to 200 ms
+    # The first, two to warm up, 100 to 200 ms, and the second in which energy is measured.
+    backend = Taking(watch, [700, 9000, 9000, *range(100, 201), *[150] * 7])
 
     def load(model: str, **_: object) -> Predictor:
         watch.now += 2.0
         return Predictor(backend)
 
-    joules = iter(0.5 * count for count in range(1000))  # half a joule each time
+    def meter() -> float:
+        return 10 * watch.now  # watts
 
     monkeypatch.setattr("trilitenet.commands.benchmark.load", load)
-    monkeypatch.setattr(command, "energy_meters", lambda names: nullcontext([lambda: next(joules)] * len(names)))
+    monkeypatch.setattr(command, "energy_meters", lambda names: nullcontext([meter] * len(names)))
     result = benchmark("a", batch=(2,), rounds=101, warmup=2, size=(32, 64))
     (row,) = result.timings
-    assert backend.runs == 1 + 2 + 101
+    assert backend.runs == 1 + 2 + 101 + 7
     assert (row.p50, row.p90, row.p99) == pytest.approx((150, 190, 199))
     assert row.frames_per_second == pytest.approx(2 / 0.15)
     assert row.first_result == pytest.approx(2.7)
-    assert row.joules == 0.25
-    assert row.watts == pytest.approx(0.5 / 0.15)
-    cells = "| a | fake | network | 64x32 | 2 | 150.00 | 190.00 | 199.00 | 13.3 | 1.00 | 2.70 | 0.25 | 3.33 |"
+    assert row.joules == pytest.approx(10 * 0.15 / 2)
+    assert row.watts == pytest.approx(10)
+    cells = "| a | fake | network | 64x32 | 2 | 150.00 | 190.00 | 199.00 | 13.3 | 1.00 | 2.70 | 0.75 | 10.00 |"
     assert result.summary().splitlines()[4] == cells
 
 
@@ -261,9 +263,63 @@ def test_what_is_asked_of_a_model_reaches_it(monkeypatch: pytest.MonkeyPatch) ->
     assert (result.machine["threads"], result.machine["streams"]) == ("3", "2")
 
 
+def test_each_model_has_its_own_energy_though_the_meter_moves_in_steps(
+    watch: Watch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = [(0.0, 0.0)]  # (time, joules) of each call's end
+
+    class Drawing(Taking):
+        """A backend that draws so many watts for 2 ms a call."""
+
+        def __init__(self, watts: float) -> None:
+            super().__init__(watch, [2] * 2000)
+            self.watts = watts
+
+        def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
+            outputs = super().run(batch)
+            drawn.append((watch.now, drawn[-1][1] + 0.002 * self.watts))
+            return outputs
+
+    def meter() -> float:  # moves every 20 ms
+        shown = watch.now // 0.02 * 0.02
+        return next(joules for time, joules in reversed(drawn) if time <= shown)
+
+    monkeypatch.setattr("trilitenet.commands.benchmark.load", lambda model, **_: Predictor(Drawing(float(model))))
+    monkeypatch.setattr(command, "energy_meters", lambda names: nullcontext([meter] * len(names)))
+    rows = benchmark("100", "400", rounds=5, warmup=0, size=(32, 64)).timings
+    assert [row.joules for row in rows] == pytest.approx([0.2, 0.8], rel=0.05)
+    assert [row.watts for row in rows] == pytest.approx([100, 400], rel=0.05)
+
+
+def test_models_of_one_file_name_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trilitenet.commands.benchmark.load", lambda model, **_: Predictor(ColourBackend()))
+    models = ("a/final.safetensors", "b/final.safetensors", "c/other.onnx")
+    result = benchmark(*models, rounds=1, warmup=0, size=(32, 64))
+    assert [row.model for row in result.timings] == [*models[:2], "other.onnx"]
+    cells = [line.split(" | ")[0] for line in result.summary().splitlines()[4:7]]
+    assert cells == ["| a/final.safetensors", "| b/final.safetensors", "| other.onnx"]
+
+
+def test_no_first_result_pays_for_importing_a_runtime(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = []
+
+    def load(model: str, **_: object) -> Predictor:
+        if "ncnn" not in sys.modules:
+            watch.now += 5.0
+            monkeypatch.setitem(sys.modules, "ncnn", ModuleType("ncnn"))
+        opened.append(Taking(watch, [700, 10]))
+        return Predictor(opened[-1])
+
+    monkeypatch.delitem(sys.modules, "ncnn", raising=False)
+    monkeypatch.setattr("trilitenet.commands.benchmark.load", load)
+    rows = benchmark("a", "b", rounds=1, warmup=0, size=(32, 64)).timings
+    assert [row.first_result for row in rows] == pytest.approx([0.7, 0.7])
+    assert [backend.runs for backend in opened] == [0, 2, 2]
+
+
 def test_energy_is_told_only_where_it_was_read_each_time(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("trilitenet.commands.benchmark.load", lambda model, **_: Predictor(Taking(watch, [10] * 10)))
-    for readings in ([1.0, 2.0, 3.0, 0.5], [1.0, 2.0, None, None]):  # the counter began anew; it is gone
+    monkeypatch.setattr("trilitenet.commands.benchmark.load", lambda model, **_: Predictor(Taking(watch, [200] * 10)))
+    for readings in ([1.0, 0.5], [1.0, None], [None, 1.0]):  # the counter began anew; it is gone; it was not there
         left = iter(readings)
         monkeypatch.setattr(command, "energy_meters", lambda names, left=left: nullcontext([lambda: next(left)]))
         result = benchmark("a", rounds=2, warmup=0, size=(32, 64))

@@ -33,6 +33,7 @@ from trilitenet.engine.evaluate import evaluate
 from trilitenet.engine.figures import FIGURES
 from trilitenet.engine.report import Figure, Report
 from trilitenet.errors import BackendError, ConfigError, InputError, OutputError, ShapeError
+from trilitenet.inference.exported_torch_backend import ExportedTorchBackend
 from trilitenet.inference.onnx_backend import OnnxBackend
 from trilitenet.inference.openvino_backend import openvino_core
 from trilitenet.inference.predictor import Predictor
@@ -139,6 +140,14 @@ def test_a_program_goes_to_other_processes_and_can_be_closed(program: Predictor)
     copy.close()
     with pytest.raises(BackendError, match=r"a\.pt2: the model was closed"):
         copy(image)
+
+
+def test_a_program_runs_on_another_device_than_it_was_exported_on(program: Predictor) -> None:
+    path = program.backend.__reduce__()[1][0]
+    backend = ExportedTorchBackend(path, "meta")  # of tensors without values; a program of two devices raises there too
+    assert backend._module is not None
+    (mask,) = backend._module(torch.zeros((1, 96, 128, 3), dtype=torch.uint8, device="meta"))
+    assert (mask.shape, mask.device.type) == ((1, 96, 128), "meta")
 
 
 def test_a_dynamic_program_says_how_small_a_side_may_be(program: Predictor) -> None:

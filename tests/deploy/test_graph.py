@@ -18,10 +18,13 @@ from trilitenet.deploy.layers import Layout
 from trilitenet.deploy.layouts import LAYOUTS
 from trilitenet.errors import ConfigError, ShapeError
 from trilitenet.inference.openvino_backend import openvino_core
+from trilitenet.inference.torch_backend import TorchBackend
 from trilitenet.models.attention import PCAA
 from trilitenet.models.blocks import DepthwiseESP
 from trilitenet.models.segmentation import SegmentationHead
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
+from trilitenet.processing.letterbox import Letterbox
+from trilitenet.processing.postprocess import threshold_mask
 
 
 def by_cell(detection: Tensor, height: int, width: int) -> Tensor:
@@ -150,7 +153,7 @@ def test_thresholds_and_probabilities() -> None:
     assert strict is not None
     wanted = outputs.lane.softmax(1)[:, 1]
     assert (probability.float() - wanted * 255).abs().max() <= 0.51
-    assert ((strict == 1) == (wanted > 0.51)).float().mean() > 0.9999
+    assert ((strict == 1) == ((wanted * 255).round() > int(0.51 * 255))).float().mean() > 0.9999
     assert torch.equal(probability, other)
 
 
@@ -167,7 +170,23 @@ def test_each_task_has_the_threshold_of_the_card(layout: str) -> None:
         )
         decided = DeployGraph(network, LAYOUTS[layout])(images)
     for task, share in shares.items():
-        assert ((getattr(decided, task) == 1) == (share > middle[task])).float().mean() > 0.999
+        wanted = (share * 255).round() > int(middle[task] * 255)
+        assert ((getattr(decided, task) == 1) == wanted).float().mean() > 0.999
+
+
+@pytest.mark.parametrize("layout", ["vectors-tiny", "planar"])
+@pytest.mark.parametrize("threshold", [0.0, 0.2, 0.4, 0.5, 0.8, 0.999])
+def test_masks_are_decided_as_the_network_decides_its_rounded_probabilities(layout: str, threshold: float) -> None:
+    network = lively_network(tasks=("drivable", "lane"))
+    images = torch.randint(0, 256, (1, 64, 128, 3), dtype=torch.uint8)
+    decided = DeployGraph(network, LAYOUTS[layout], thresholds=Thresholds(drivable=threshold, lane=threshold))
+    raw = TorchBackend(network, "cpu").run(images.numpy())
+    letterbox = Letterbox.fit((64, 128), canvas=(64, 128))
+    with torch.inference_mode():
+        outputs = decided(images)
+    for task in ("drivable", "lane"):
+        wanted = threshold_mask(getattr(raw, task)[0], letterbox, threshold)
+        assert (getattr(outputs, task)[0].numpy() == wanted).mean() > 0.9995
 
 
 def test_boxes_are_decoded_in_full_precision() -> None:

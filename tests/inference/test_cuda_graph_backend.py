@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import collections
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,7 @@ from trilitenet.commands.load import load
 from trilitenet.deploy.graph import DeployGraph
 from trilitenet.deploy.layouts import LAYOUTS
 from trilitenet.errors import BackendError, ConfigError, ShapeError
-from trilitenet.inference.cuda_graph_backend import CudaGraphBackend
+from trilitenet.inference.cuda_graph_backend import CudaGraphBackend, _filled
 from trilitenet.inference.torch_backend import TorchBackend
 from trilitenet.models.weights import load_network
 
@@ -42,12 +44,44 @@ def test_the_cpu_is_refused() -> None:
         CudaGraphBackend(DeployGraph(network), network.card, "cpu")
 
 
+def test_few_shapes_are_captured_and_memory_is_made_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    captured: list[tuple[int, ...]] = []
+    room = [True]
+
+    def capture(self: CudaGraphBackend, network: object, shape: tuple[int, ...]) -> str:
+        if not room[0]:
+            room[0] = True
+            raise torch.OutOfMemoryError
+        captured.append(shape)
+        return f"graph of {shape}"
+
+    monkeypatch.setattr(CudaGraphBackend, "_capture", capture)
+    backend = object.__new__(CudaGraphBackend)
+    backend._graph, backend._card = lambda pixels: (None, None, None), load_network("tiny").card
+    backend._captured = collections.OrderedDict()
+    for _ in range(3):
+        for count in range(1, 9):
+            for height in (384, 512):
+                shape = _filled((count, height, 640, 3))
+                assert str(backend._get(shape)) == f"graph of {shape}"
+    assert len(captured) == len(set(captured)) == 8
+    assert {shape[0] for shape in captured} == {1, 2, 4, 8}
+    assert [_filled((count, 32, 32, 3))[0] for count in (9, 12, 16, 17, 32)] == [16, 16, 16, 24, 32]
+    room[0] = False
+    backend._get((8, 640, 640, 3))
+    assert list(backend._captured) == [(8, 640, 640, 3)]
+    room[0] = False
+    backend._captured.clear()
+    with pytest.raises(torch.OutOfMemoryError):
+        backend._get((8, 640, 640, 3))
+
+
 @needs_cuda
 def test_replays_equal_the_network(rng: np.random.Generator) -> None:
     network = load_network("tiny")
     with load("tiny", device="cuda") as predictor:
         assert "graph" in predictor.backend.name
-        for batch in (1, 2, 1):
+        for batch in (1, 2, 3, 1):
             images = rng.integers(0, 256, (batch, 128, 192, 3), dtype=np.uint8)
             wanted, got = TorchBackend(network, "cpu").run(images), predictor.backend.run(images)
             assert got.detection is not None

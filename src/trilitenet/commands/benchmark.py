@@ -9,8 +9,9 @@ import json
 import math
 import os
 import platform
-import statistics
+import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trilitenet
-from trilitenet.commands.energy import energy_meters
+from trilitenet.commands.energy import Meter, energy_meters
 from trilitenet.commands.load import check_parallel, load, own_builder
 from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, one_for_several, optional_path
 from trilitenet.config import TASKS, VARIANTS, check_size
@@ -32,6 +33,9 @@ from trilitenet.processing.cores import processor, usable_cores
 __all__ = ["Benchmark", "Cost", "Timing", "benchmark"]
 
 _PLOTS: Final = (".png", ".svg", ".pdf")
+_RUNTIMES: Final = frozenset({"torch", "onnxruntime", "openvino", "ncnn", "executorch", "tensorrt"})
+_ENERGY_WINDOW: Final = 1.0
+"""Seconds that each call is repeated for to measure its energy."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +43,7 @@ class Timing:
     """One model on one runtime at one batch size.
 
     Attributes:
-        model: As it was named.
+        model: The name of its file; as it was named where several files have that.
         backend: The runtime, device and precision.
         stage: ``"network"`` (letterboxed pixels to raw outputs) or ``"frame"`` (image to boxes and masks of its size).
         batch: Images a call.
@@ -49,10 +53,10 @@ class Timing:
         p99: 99th percentile.
         frames_per_second: Images a second at the median.
         ratio: Median over the rounds of the first entry's time an image over this one's: above 1 is faster.
-        first_result: Seconds from loading the model to its first result.
+        first_result: Seconds from loading the model to its first result; its runtime had been imported before.
         joules: A frame, of the GPU where the runtime is on one, else of the processor package; of a Jetson, the whole
-            module's. None where it cannot be read.
-        watts: Mean over the measurement; None likewise.
+            module's. From a second in which nothing else was measured; None where it cannot be read.
+        watts: Mean over that second; None likewise.
     """
 
     model: str
@@ -231,11 +235,17 @@ class _Entry:
         self, model: str, backend: str, device: str, streams: int, threads: int | None, network: str | None
     ) -> None:
         self.model = model
-        started = time.perf_counter()
-        self.predictor: Predictor = load(
-            model, network=network, backend=backend, device=device, streams=streams, threads=threads
-        )
-        self.loading = time.perf_counter() - started
+        imported = _RUNTIMES & sys.modules.keys()
+        while True:
+            started = time.perf_counter()
+            self.predictor: Predictor = load(
+                model, network=network, backend=backend, device=device, streams=streams, threads=threads
+            )
+            self.loading = time.perf_counter() - started
+            if _RUNTIMES & sys.modules.keys() == imported:
+                break
+            imported = _RUNTIMES & sys.modules.keys()  # the first of a runtime would pay for all
+            self.predictor.close()
         self.first: float | None = None
 
 
@@ -246,7 +256,8 @@ class _Call:
         self.entry, self.batch, self.stage = entry, batch, stage
         generator = np.random.default_rng(0)
         self.milliseconds: list[float] = []
-        self.joules: list[float] = []
+        self.joules: float | None = None
+        self.watts: float | None = None
         predictor = entry.predictor
         if stage == "network":
             self.size = predictor.backend.canvas or size
@@ -265,32 +276,40 @@ class _Call:
         if self.entry.first is None:
             self.entry.first = self.entry.loading + time.perf_counter() - started
 
+    def draw(self, meter: Meter) -> None:
+        """Note the joules an image and the watts of a second alone: meters move in steps of up to 0.1 seconds."""
+        before, started, images = meter(), time.perf_counter(), 0
+        while before is not None and time.perf_counter() - started < _ENERGY_WINDOW:
+            self.run()
+            images += self.batch
+        after, seconds = meter(), time.perf_counter() - started
+        if before is not None and after is not None and after >= before:  # the counter begins anew now and then
+            self.joules, self.watts = (after - before) / images, (after - before) / seconds
+
 
 def _measure(calls: Sequence[_Call], rounds: int, warmup: int) -> tuple[Timing, ...]:
-    with energy_meters([call.entry.predictor.backend.name for call in calls]) as meters:
+    for call in calls:
+        call.once()
+    for _ in range(warmup):
         for call in calls:
-            call.once()
-        for _ in range(warmup):
-            for call in calls:
-                call.run()
-        for _ in range(rounds):
-            for call, meter in zip(calls, meters, strict=True):
-                before = meter()
-                started = time.perf_counter()
-                call.run()
-                call.milliseconds.append(1e3 * (time.perf_counter() - started))
-                after = meter()
-                if before is not None and after is not None and after >= before:
-                    call.joules.append(after - before)
+            call.run()
+    for _ in range(rounds):
+        for call in calls:
+            started = time.perf_counter()
+            call.run()
+            call.milliseconds.append(1e3 * (time.perf_counter() - started))
+    with energy_meters([call.entry.predictor.backend.name for call in calls]) as meters:
+        for call, meter in zip(calls, meters, strict=True):
+            call.draw(meter)
+    names = _short([call.entry.model for call in calls])
     first = np.array(calls[0].milliseconds) / calls[0].batch
     timings = []
     for call in calls:
         times = np.array(call.milliseconds)
         p50, p90, p99 = (float(np.percentile(times, percent)) for percent in (50, 90, 99))
-        energy = statistics.fmean(call.joules) if len(call.joules) == rounds else None
         timings.append(
             Timing(
-                model=Path(call.entry.model).name,
+                model=names[call.entry.model],
                 backend=call.entry.predictor.backend.name,
                 stage=call.stage,
                 batch=call.batch,
@@ -301,8 +320,8 @@ def _measure(calls: Sequence[_Call], rounds: int, warmup: int) -> tuple[Timing, 
                 frames_per_second=1e3 * call.batch / p50,
                 ratio=float(np.median(first / (times / call.batch))),
                 first_result=call.entry.first or 0.0,
-                joules=None if energy is None else energy / call.batch,
-                watts=None if energy is None else 1e3 * energy / statistics.fmean(call.milliseconds),
+                joules=call.joules,
+                watts=call.watts,
             )
         )
     return tuple(timings)
@@ -337,12 +356,13 @@ def _costs(size: tuple[int, int], network: str | None) -> tuple[Cost, ...]:
 def _plot(calls: Sequence[_Call], path: Path) -> None:
     from matplotlib.figure import Figure
 
+    names = _short([call.entry.model for call in calls])
     figure = Figure(figsize=(8, 1 + 0.6 * len(calls)), layout="constrained")
     axes = figure.subplots()
     axes.boxplot([call.milliseconds for call in calls], orientation="horizontal", whis=(1, 99), showfliers=False)
     axes.set_yticks(
         range(1, len(calls) + 1),
-        [f"{Path(call.entry.model).name}\n{call.entry.predictor.backend.name}, batch {call.batch}" for call in calls],
+        [f"{names[call.entry.model]}\n{call.entry.predictor.backend.name}, batch {call.batch}" for call in calls],
     )
     axes.invert_yaxis()
     axes.set_xlabel("milliseconds a call (box: quartiles, whiskers: 1st and 99th percentile)")
@@ -350,6 +370,12 @@ def _plot(calls: Sequence[_Call], path: Path) -> None:
     picture = io.BytesIO()
     figure.savefig(picture, format=path.suffix[1:].lower())
     write_file(path, picture.getvalue())
+
+
+def _short(models: Sequence[str]) -> dict[str, str]:
+    """Return what to call each model: the name of its file, where no other has it."""
+    count = Counter(Path(model).name for model in set(models))
+    return {model: Path(model).name if count[Path(model).name] == 1 else model for model in models}
 
 
 def _or_dash(value: float | None) -> str:

@@ -54,6 +54,7 @@ from trilitenet.models.attention import BINS, PCAA
 from trilitenet.models.detection import DetectionHead, LitePAN
 from trilitenet.models.segmentation import SegmentationHead, UpStage
 from trilitenet.models.trilitenet import TriLiteNet, foreign_layers
+from trilitenet.processing.postprocess import mask_limit
 
 __all__ = ["DeployGraph", "DeployOutputs", "Traceable"]
 
@@ -292,7 +293,8 @@ class MaskGraph(nn.Module):
         self.up1 = UpStageGraph(head.up1, layout, self.columns.quarter)
         self.up2 = UpStageGraph(head.up2, layout, self.columns.half, layout.half, before)
         slopes = prelu_slopes(head.out.act, 2)
-        threshold = 0.5 if masks == "probability" else threshold
+        # Decided as the network's rounded probabilities are: between the highest that is not above and the next.
+        threshold = 0.5 if masks == "probability" else (mask_limit(threshold) + 0.5) / 255
         self.out: FusedConv | FusedTransposedConv
         self.difference, self.enlarge = nn.ModuleList(), nn.ModuleList()
         if not layout.channels_last and layout.half == 1:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.processing.boxes import box_iou, cxcywh_to_xyxy
-from trilitenet.processing.postprocess import judge
+from trilitenet.processing.postprocess import judge, mask_limit
 from trilitenet.structures import RawOutputs
 
 __all__ = ["TOLERANCES", "Parity", "Tolerance", "compare"]
@@ -116,7 +116,7 @@ def compare(
         for name, threshold in zip(("drivable", "lane"), masks, strict=True):
             wanted, mask = getattr(expected, name), getattr(got, name)
             if wanted is not None:
-                limit = int(threshold * 255)
+                limit = mask_limit(threshold)
                 equal[name].append(float(np.mean((wanted[0] > limit) == (mask[0] > limit))))
         if expected.detection is not None and got.detection is not None:
             rows += [(expected.detection[0], got.detection[0]), (got.detection[0], expected.detection[0])]

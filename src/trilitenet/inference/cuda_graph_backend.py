@@ -22,8 +22,8 @@ __all__ = ["CudaGraphBackend"]
 
 _WARM_UP: Final = 3
 """Runs before a capture, in which cuDNN chooses its kernels and the allocator grows."""
-_SHAPES: Final = 8
-"""So many batch shapes stay captured; the one longest unused makes room."""
+_SHAPES: Final = 16
+"""So many batch shapes stay captured; the one longest unused makes room, and all do where memory runs out."""
 
 
 class _Captured(NamedTuple):
@@ -38,6 +38,8 @@ class _Captured(NamedTuple):
 
 class CudaGraphBackend:
     """A network that is launch-bound when run eagerly (its kernels take microseconds), replayed as one launch.
+
+    A batch is filled up to 1, 2, 4 or a multiple of 8, so that few shapes are captured: each takes seconds, and memory.
 
     Args:
         graph: Module or function of (B, H, W, 3) uint8 RGB pixels on the device that returns detections (B, N, 5 +
@@ -75,7 +77,7 @@ class CudaGraphBackend:
 
     @property
     def canvas(self) -> tuple[int, int] | None:
-        """None: any size in multiples of 32 will do; each is captured when first seen."""
+        """None: any size in multiples of 32 will do; each is captured when it is first seen."""
         return None
 
     def run(self, batch: NDArray[np.uint8]) -> RawOutputs:
@@ -83,10 +85,10 @@ class CudaGraphBackend:
         check_batch(batch, MAX_STRIDE)
         with self._lock, torch.cuda.device(self.device), torch.inference_mode():
             try:
-                captured = self._get(batch.shape)
+                captured = self._get(_filled(batch.shape))
             except torch.OutOfMemoryError as error:
                 raise out_of_memory(self.name, batch) from error
-            captured.host.numpy()[:] = batch
+            captured.host.numpy()[: len(batch)] = batch
             captured.pixels.copy_(captured.host, non_blocking=True)
             captured.graph.replay()
             for output, result in zip(captured.outputs, captured.results, strict=True):
@@ -94,7 +96,7 @@ class CudaGraphBackend:
                     result.copy_(output, non_blocking=True)
             torch.cuda.current_stream().synchronize()
             found = {
-                task: None if result is None else result.numpy().copy()
+                task: None if result is None else result.numpy()[: len(batch)].copy()
                 for task, result in zip(TASKS, captured.results, strict=True)
             }
         return RawOutputs(**found)
@@ -113,6 +115,17 @@ class CudaGraphBackend:
             return self._captured[shape]
         while len(self._captured) >= _SHAPES:
             self._captured.popitem(last=False)
+        try:
+            self._captured[shape] = self._capture(network, shape)
+        except torch.OutOfMemoryError:
+            if not self._captured:
+                raise
+            self._captured.clear()
+            torch.cuda.empty_cache()
+            self._captured[shape] = self._capture(network, shape)
+        return self._captured[shape]
+
+    def _capture(self, network: Callable[[Tensor], Sequence[Tensor | None]], shape: tuple[int, ...]) -> _Captured:
         host = torch.zeros(shape, dtype=torch.uint8, pin_memory=True)
         pixels = host.to(self.device)
         side = torch.cuda.Stream()
@@ -128,5 +141,10 @@ class CudaGraphBackend:
             None if output is None else torch.empty(output.shape, dtype=output.dtype, pin_memory=True)
             for output in outputs
         )
-        self._captured[shape] = _Captured(graph, host, pixels, outputs, results)
-        return self._captured[shape]
+        return _Captured(graph, host, pixels, outputs, results)
+
+
+def _filled(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the shape of a batch that is filled up."""
+    count = shape[0]
+    return (1 << (count - 1).bit_length() if count <= 8 else -(-count // 8) * 8, *shape[1:])

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.export.passes import move_to_device_pass
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY
 from trilitenet.errors import ShapeError, WeightsError
@@ -26,7 +27,8 @@ class ExportedTorchBackend(ArtefactBackend):
 
     Args:
         path: The ``.pt2`` file.
-        device: As `trilitenet.inference.torch_backend.pick_device` takes it; only the CPU is tested.
+        device: As `trilitenet.inference.torch_backend.pick_device` takes it; auto is the CPU, for which it was
+            exported. On another it is tested for shapes alone.
 
     Raises:
         WeightsError: If the file is missing, broken or foreign, or of a newer layout.
@@ -54,7 +56,9 @@ class ExportedTorchBackend(ArtefactBackend):
         self._card, self.info = read_metadata(found, str(path))
         self.device = pick_device("cpu" if device == "auto" else device)
         self._path = path
-        self._module: torch.nn.Module | None = program.module().to(self.device)
+        if self.device.type != "cpu":  # the program makes tensors of its own, and checks where its inputs are
+            program = move_to_device_pass(program, str(self.device))
+        self._module: torch.nn.Module | None = program.module()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle it as what opens it again: its file, which must be there, and its device."""

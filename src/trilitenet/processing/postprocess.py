@@ -14,7 +14,7 @@ from trilitenet.processing.letterbox import Letterbox
 from trilitenet.processing.nms import nms
 from trilitenet.structures import Boxes, Perception, RawOutputs
 
-__all__ = ["judge", "select_boxes", "threshold_mask", "to_perceptions"]
+__all__ = ["judge", "mask_limit", "select_boxes", "threshold_mask", "to_perceptions"]
 
 
 def to_perceptions(
@@ -91,6 +91,14 @@ def select_boxes(detection: NDArray[np.float32], letterbox: Letterbox, threshold
     )
 
 
+def mask_limit(threshold: float) -> int:
+    """Return the highest probability x 255, rounded to a whole number, that is not above a threshold in [0, 1].
+
+    A whole number is above 255 t exactly when it is above the integer part of that.
+    """
+    return int(threshold * 255)
+
+
 def threshold_mask(mask: NDArray[np.uint8], letterbox: Letterbox, threshold: float) -> NDArray[np.bool_]:
     """Decide each pixel of the source image.
 
@@ -102,6 +110,5 @@ def threshold_mask(mask: NDArray[np.uint8], letterbox: Letterbox, threshold: flo
     Returns:
         (height, width) bool of the source size.
     """
-    # An integer q is above t * 255 exactly when it is above the integer part of that.
-    decided: NDArray[np.bool_] = letterbox.mask_to_source(mask) > np.uint8(int(threshold * 255))
+    decided: NDArray[np.bool_] = letterbox.mask_to_source(mask) > np.uint8(mask_limit(threshold))
     return decided

@@ -23,7 +23,8 @@ from uvicorn.protocols.http.flow_control import FlowControl
 
 from tests.apps.server.conftest import FakeBackend, MakeApp, Running, encode, picture
 from trilitenet.apps.server.application import Application
-from trilitenet.apps.server.process import GuardedProtocol, JsonFormatter
+from trilitenet.apps.server.process import GuardedProtocol, JsonFormatter, build_server
+from trilitenet.errors import BackendError
 
 Run = Callable[[Application], Running]
 _T = TypeVar("_T")
@@ -594,6 +595,21 @@ def _start_script() -> tuple[subprocess.Popen[str], int]:
         entry = json.loads(process.stderr.readline())
         if entry["message"] == "listening":
             return process, int(entry["url"].split(":")[-1].strip("/"))
+
+
+def test_a_model_that_fails_at_the_start_is_one_line(
+    make_app: MakeApp, backend: FakeBackend, caplog: pytest.LogCaptureFixture
+) -> None:
+    backend.error = BackendError("the runtime failed (no kernel\nfor this device)")
+    server = build_server(make_app())
+    listener = socket.create_server(("127.0.0.1", 0))
+    with listener, caplog.at_level("INFO"), pytest.raises(BackendError) as caught:
+        server.run([listener])
+    assert str(caught.value).endswith(
+        "cannot serve, the first image failed (the runtime failed (no kernel for this device))"
+    )
+    assert not {"listening", "Application startup failed. Exiting."} & {record.message for record in caplog.records}
+    assert not logging.getLogger("uvicorn.error").filters
 
 
 def test_a_second_ctrl_c_ends_at_once_without_a_traceback() -> None:

@@ -20,6 +20,7 @@ from uvicorn.server import ServerState
 from trilitenet.apps.server.application import Application
 from trilitenet.apps.server.metrics import Metrics
 from trilitenet.apps.server.settings import Settings
+from trilitenet.errors import BackendError, gist
 
 __all__ = ["GuardedProtocol", "GuardedServer", "JsonFormatter", "build_server", "set_up_logs"]
 
@@ -271,16 +272,33 @@ class GuardedServer(uvicorn.Server):
 
         Raises:
             KeyboardInterrupt: If a second one came before all that was accepted was answered.
+            BackendError: If the model does not get through the image with which the service starts.
         """
+        service = self._application.service
+        log = logging.getLogger("uvicorn.error")
+
+        def unsaid(record: logging.LogRecord) -> bool:
+            return service.failure is None  # which is told below, in one line
+
+        log.addFilter(unsaid)
         try:
             super().run(sockets)
         except KeyboardInterrupt:  # uvicorn raises the signal again when it has heeded it
             if self.force_exit:
                 raise
+        except SystemExit:
+            if service.failure is None:
+                raise
+        finally:
+            log.removeFilter(unsaid)
+        if service.failure is not None:
+            raise BackendError(f"{service.name}: cannot serve, the first image failed ({gist(service.failure)})")
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start, and say where."""
         await super().startup(sockets)
+        if not self.started:
+            return
         for listener in sockets or []:
             host, port = listener.getsockname()[:2]
             _LOGGER.info("listening", extra={"url": f"http://{f'[{host}]' if ':' in host else host}:{port}/"})

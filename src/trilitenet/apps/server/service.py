@@ -80,6 +80,8 @@ class Service:
         self.memory = MemoryBudget(settings.memory)
         self.admission = Admission(settings.queue, _PATIENCE * settings.deadline)
         self.draining = False
+        self.failure: BaseException | None = None
+        """What came in the way of the first image, with which the service starts."""
         self._warm = False
         self._batcher = Batcher(
             predictor.backend.run,
@@ -117,7 +119,11 @@ class Service:
         file = io.BytesIO()
         Image.new("RGB", (width, height), (114, 114, 114)).save(file, "JPEG")
         image = Encoded(file.getvalue(), Header("JPEG", width, height, 1))
-        await self._stages(image, math.inf, lambda outcome: outcome.perception.to_dict(), self.predictor, False)
+        try:
+            await self._stages(image, math.inf, lambda outcome: outcome.perception.to_dict(), self.predictor, False)
+        except BaseException as error:
+            self.failure = error
+            raise
         self._warm = True
 
     async def stop(self) -> None:
