@@ -17,9 +17,11 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from rich.progress import Progress, TaskID
 
 from tests.fakes import ColourBackend, coloured_scene
 from trilitenet.apps import cli
+from trilitenet.commands import predict as command
 from trilitenet.commands.predict import RoadOptions, predict_with
 from trilitenet.errors import BackendError, ConfigError, InputError, MissingExtraError, OutputError, ShapeError
 from trilitenet.inference.predictor import Predictor
@@ -368,6 +370,33 @@ def test_a_shard_opens_neither_what_others_do_nor_what_is_done(
     assert opened == read == ["1", "3"]
 
 
+def test_of_many_sources_few_bars_are_shown(
+    tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[int] = []
+    bars: list[Progress] = []
+
+    class Bars(Progress):
+        def add_task(self, *words: Any, **options: Any) -> TaskID:
+            bars.append(self)
+            added = super().add_task(*words, **options)
+            shown.append(len(self.tasks))
+            return added
+
+    monkeypatch.setattr("trilitenet.commands.progress.Progress", Bars)
+    monkeypatch.setattr(command, "_MOST_BARS", 3)
+    clips = [tmp_path / f"{number}.mp4" for number in range(4)]
+    for clip in clips:
+        drive(clip, frames=2)
+    for count, most in ((3, 3), (4, 2)):
+        shown.clear()
+        report = predict_with(predictor, clips[:count], tmp_path / str(count), overlay=False)
+        assert report.frames == 2 * count
+        assert max(shown) == most
+    (left,) = bars[-1].tasks
+    assert (left.description, left.completed, left.total) == ("all sources", 4, 4)
+
+
 @pytest.mark.parametrize("shard", ["", "1", "2/2", "-1/2", "1/0", "0/0", "1.0/2", "a/b", "0 / 2", "1/" + "9" * 5000])
 def test_what_is_no_shard_is_one_line(folder: Path, tmp_path: Path, predictor: Predictor, shard: str) -> None:
     with pytest.raises(ConfigError, match="--shard must be I/N with I from 0 to N - 1, such as 0/16, got "):
@@ -378,7 +407,8 @@ def test_sources_may_stand_in_a_file(
     folder: Path, tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     listing = tmp_path / "list.txt"
-    listing.write_text(f"{folder / 'grey.png'}\n\n  {folder / 'deep.png'}  \r\n{folder / 'grey.png'}\n")
+    lines = f"{folder / 'grey.png'}\n\n  {folder / 'deep.png'}  \r\n{folder / 'grey.png'}\n"
+    listing.write_text(lines, encoding="utf-8-sig")  # as Windows writes it
     words = ["predict", str(folder / "alpha.png"), "--model", str(weights), "--output", str(tmp_path / "out")]
     assert cli.main([*words, "--from-file", str(listing)]) == 0
     assert {path.stem for path in (tmp_path / "out").iterdir()} == {"alpha", "grey", "deep"}

@@ -20,6 +20,7 @@ import pytest
 from PIL import Image
 
 from trilitenet.errors import ConfigError, InputError
+from trilitenet.inference import sources
 from trilitenet.inference.sources import (
     CameraReader,
     Clip,
@@ -503,6 +504,13 @@ def test_a_url_without_an_end_is_a_stream_and_one_without_an_answer_is_told_with
     assert not {"secret", "token"} & set(re.findall(r"\w+", f"{failure.source} {failure.reason}"))
 
 
+def test_each_frame_of_a_stream_is_there_as_soon_as_it_came(tmp_path: Path) -> None:
+    video(tmp_path / "a.mp4", frames=3)
+    for live, kind in ((True, "SLICE"), (False, "AUTO")):
+        with sources._open_container(str(tmp_path / "a.mp4"), "a", live=live) as container:
+            assert container.streams.video[0].thread_type.name == kind
+
+
 def test_closing_ends_the_wait_for_a_stream() -> None:
     with Server([transport_stream(0, 3)]) as server:
         reader = StreamReader(server.url, backoff=60)
@@ -524,8 +532,25 @@ def test_the_wait_grows_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     assert waits == [1, 2, 4, 5, 5]
 
 
+def test_a_url_of_a_file_of_this_machine_is_its_path(tmp_path: Path) -> None:
+    path = tmp_path / "a drive.mp4"
+    video(path, frames=5)
+    for url in (path.as_uri(), path.as_uri().replace("file:///", "FILE://localhost/")):
+        (source,), _ = find_sources([url, path])
+        assert isinstance(source, VideoReader)
+        assert source.name == str(path)
+        assert len(list(source)) == 5
+
+
 def test_a_url_of_a_file_is_read_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     video(tmp_path / "a.mp4", frames=5)
+    (tmp_path / "a.ts").write_bytes(transport_stream(0, 5))
+    with av.open(str(tmp_path / "a.h264"), "w", format="h264") as raw:
+        stream = raw.add_stream("h264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for i in range(5):
+            raw.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((48, 64, 3), 40 * i, np.uint8), format="rgb24")))
+        raw.mux(stream.encode(None))
     opened, plain = [], av.open
 
     def noted(*args: Any, **options: Any) -> Any:
@@ -540,10 +565,11 @@ def test_a_url_of_a_file_is_read_to_its_end(tmp_path: Path, monkeypatch: pytest.
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
-        (source,), failures = find_sources([f"http://127.0.0.1:{server.server_port}/a.mp4"])
-        assert not failures
-        assert isinstance(source, VideoReader)
-        assert len(list(source)) == 5
+        for name in ("a.mp4", "a.ts", "a.h264"):  # the last has no length in seconds
+            (source,), failures = find_sources([f"http://127.0.0.1:{server.server_port}/{name}"])
+            assert not failures
+            assert isinstance(source, VideoReader)
+            assert len(list(source)) == 5
         assert opened == [10.0] * len(opened)
         assert opened
     finally:
@@ -598,9 +624,13 @@ def test_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
             released.append(self)
 
     monkeypatch.setattr("cv2.VideoCapture", Camera)
-    frames = list(CameraReader(0))
+    frames = list(CameraReader(0, Clip(max_frames=3)))
     assert len(frames) == 3
     assert len(released) == 1
+    lost = iter(CameraReader(0))
+    assert [next(lost).index for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(InputError, match=r"^camera-0: gives no more frames; is it still connected"):
+        next(lost)
     assert frames[0].source == "camera-0"
     np.testing.assert_array_equal(frames[0].image[0, 0], [0, 0, 255])
     with pytest.raises(InputError, match="camera-7: there is no such camera"):
@@ -612,7 +642,7 @@ def test_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
         return levels[-2]
 
     monkeypatch.setattr("cv2.setLogLevel", set_level, raising=False)  # as in OpenCV 4
-    assert len(list(CameraReader(0))) == 3
+    assert len(list(CameraReader(0, Clip(max_frames=3)))) == 3
     assert levels == [3, 0, 3]
 
 

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trilitenet.errors import ConfigError, ShapeError
+from trilitenet.processing import drawing
 from trilitenet.processing.drawing import BOX_COLOURS, DRIVABLE_COLOUR, LANE_COLOUR, draw, draw_label
 from trilitenet.structures import Boxes, Perception
 
@@ -97,6 +98,19 @@ def test_labels_stay_inside(corner: tuple[int, int]) -> None:
     draw_label(canvas, "a label longer than the canvas is wide", corner, (255, 0, 0), size=12)
     draw_label(canvas, "x", corner, (255, 0, 0), size=12)
     assert canvas.any()
+
+
+def test_texts_that_change_from_frame_to_frame_are_not_kept() -> None:
+    canvas = np.zeros((60, 400, 3), np.uint8)
+    drawing.draw_label(canvas, "vehicle 0.87", (5, 30), (0, 0, 0))
+    before = drawing._kept_plate.cache_info()
+    for number in range(3):
+        drawing.draw_label(canvas, "vehicle 0.87", (5, 30), (0, 0, 0))
+        drawing.draw_label(canvas, f"offset {number / 100:.2f} m, heading 0.01 rad, 12.3 m/s", (5, 30), (0, 0, 0))
+    after = drawing._kept_plate.cache_info()
+    assert (after.currsize, after.hits - before.hits) == (before.currsize, 3)
+    most = 512 * drawing._plate("m" * drawing._SHORT, 24, (0, 0, 0)).nbytes  # the letters of a 1080p frame
+    assert (after.maxsize, most < 2**26) == (512, True)
 
 
 def test_a_tiny_image_can_be_drawn_on() -> None:

@@ -54,6 +54,8 @@ _HEAD: Final = 65536
 """Bytes of a JSON file in which its source is named, though the file may be as long as a video."""
 _JPEG_QUALITY: Final = 92
 """Of overlays on pictures, of 100."""
+_MOST_BARS: Final = 10
+"""Of more sources than these, only the bar of the one at hand is shown, below that of all."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -488,9 +490,15 @@ class _Job:
             progress = stack.enter_context(show_bars(*columns, TimeRemainingColumn(), quiet=quiet))
             if self.window is not None:
                 stack.enter_context(contextlib.closing(self.window))
+            many = len(self.sources) > _MOST_BARS
+            all_of_them = progress.add_task("all sources", total=len(self.sources)) if many else None
             try:
                 for source in self.sources:
                     self._run_source(source, predictor, progress)
+                    if all_of_them is not None:
+                        for task in progress.task_ids[1:]:
+                            progress.remove_task(task)
+                        progress.advance(all_of_them)
             except _WindowClosed:
                 pass
             except KeyboardInterrupt:
@@ -555,7 +563,7 @@ class _Job:
                 self.videos -= self.frames == before
         if video is not None and video.frames:
             self.files.append(video.path)
-        progress.update(task, total=progress.tasks[task].completed)
+        progress.update(task, total=next(bar.completed for bar in progress.tasks if bar.id == task))
 
     def _take(self, perception: Perception, road: Road | None, video: VideoWriter | None) -> None:
         """Write and draw one perception; an interruption waits, so that no result is a frame ahead of another."""
@@ -599,7 +607,7 @@ def _read_list(path: StrPath) -> list[str]:
         InputError: If it cannot be read, or names nothing.
     """
     try:
-        names = [line for line in map(str.strip, Path(path).read_text(encoding="utf-8").splitlines()) if line]
+        names = [line for line in map(str.strip, Path(path).read_text(encoding="utf-8-sig").splitlines()) if line]
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as text ({getattr(error, 'strerror', None) or error})") from error
     if not names:

@@ -21,6 +21,7 @@ import sys
 import threading
 import time
 import urllib.parse
+import urllib.request
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -50,7 +51,8 @@ __all__ = [
 VIDEO_SUFFIXES: Final = frozenset(
     {
         ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".m2ts", ".mts", ".wmv", ".flv",
-        ".3gp", ".ogv", ".gif", ".h264", ".264", ".hevc", ".h265", ".mjpeg", ".y4m",
+        ".3gp", ".3g2", ".ogv", ".gif", ".h264", ".264", ".hevc", ".h265", ".mjpeg", ".y4m", ".qt", ".asf", ".vob",
+        ".m2v", ".mxf", ".dav",
     }
 )  # fmt: skip
 """File name endings, in lower case, that are taken for videos."""
@@ -63,6 +65,8 @@ _SLACK: Final = 1e-6
 """Seconds that a time stamp may be off by: a frame at 2/3 s is not before a start of 0.666667."""
 _WITH_LENGTH: Final = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "flv", "asf")
 """FFmpeg's names of the containers that state their length, which of others is found from what is there."""
+_PLAYLISTS: Final = ("hls", "hls,applehttp", "dash")
+"""FFmpeg's names of lists of pieces of a video."""
 _INDEX_FIRST: Final = "its index comes first: ffmpeg -i IN -c copy -movflags +faststart OUT"
 _KEY_FRAMES: Final = 10.0
 """Seconds in which a video is expected to have a key frame."""
@@ -357,7 +361,7 @@ class StreamReader(FrameReader):
                     return
             attempt += 1
             try:
-                with _open_container(self._url, self.name, timeout=_PATIENCE) as container:
+                with _open_container(self._url, self.name, timeout=_PATIENCE, live=True) as container:
                     offset: float | None = None
                     timeless = bool(container.format.flags & _NO_TIMESTAMPS)
                     step = 0.0 if timeless else _step(container, self)
@@ -408,7 +412,8 @@ class CameraReader(FrameReader):
             while True:
                 taken, bgr = camera.read()
                 if not taken:
-                    return
+                    more = "" if began is None else " more"
+                    raise InputError(f"{self.name}: gives no{more} frames; is it still connected?")
                 began = time.monotonic() if began is None else began
                 yield time.monotonic() - began, functools.partial(cv2.cvtColor, bgr, cv2.COLOR_BGR2RGB)
         finally:
@@ -508,7 +513,7 @@ def find_sources(
 
     taken: set[Path] = set()
     place = _placing()
-    for name in dict.fromkeys(os.fspath(name) for name in names):
+    for name in dict.fromkeys(_local(os.fspath(name)) for name in names):
         if re.match(r"[a-z][a-z0-9+.-]+://", name, re.IGNORECASE):
             add(functools.partial(_open_url, name, clip), name)
         elif name == "-" or (name == "stdin" and not Path(name).exists()):
@@ -561,11 +566,18 @@ def _printable(name: str) -> str:
     return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
+def _local(name: str) -> str:
+    """Return the path that a ``file://`` URL of this machine stands for; anything else as it is."""
+    parts = urllib.parse.urlsplit(name) if name[:7].lower() == "file://" else None
+    return urllib.request.url2pathname(parts.path) if parts and parts.netloc in {"", "localhost"} else name
+
+
 def _open_url(url: str, clip: Clip | None) -> FrameReader:
-    """Return a reader of a file behind an HTTP URL, which has an end, or of a live stream."""
-    if url.lower().startswith("http"):
+    """Return a reader of a file behind an HTTP or FTP URL, which has an end, or of a live stream."""
+    if re.match("https?:|ftp:", url, re.IGNORECASE):
         with _open_container(url, _without_secrets(url), timeout=_PATIENCE) as container:
-            if container.duration:
+            # A file has a length in seconds or in bytes; that in bytes of a playlist, which may grow, is its own.
+            if container.duration or (container.size > 0 and container.format.name not in _PLAYLISTS):
                 return VideoReader(url, clip, timeout=_PATIENCE)
     return StreamReader(url, clip)
 
@@ -635,8 +647,8 @@ def _av() -> Any:
     return import_extra("av", "video")
 
 
-def _open_container(path: str, name: str, *, timeout: float | None = None) -> Any:
-    """Open what has a video stream.
+def _open_container(path: str, name: str, *, timeout: float | None = None, live: bool = False) -> Any:
+    """Open what has a video stream; of a ``live`` one each frame is decoded as soon as it is there.
 
     Raises:
         InputError: If that fails; one line, with the name.
@@ -655,7 +667,8 @@ def _open_container(path: str, name: str, *, timeout: float | None = None) -> An
     if not container.streams.video:
         container.close()
         raise InputError(f"{name}: has no video stream")
-    container.streams.video[0].thread_type = "AUTO"
+    # Several frames at once are faster, but each thread holds one back.
+    container.streams.video[0].thread_type = "SLICE" if live else "AUTO"
     return container
 
 

@@ -200,8 +200,8 @@ def draw_label(
         size: Height of the letters in pixels; by the canvas if left out.
     """
     height, width = canvas.shape[:2]
-    plate = _plate(text, size or max(10, round(max(height, width) / 80)), colour)
-    plate = plate[:height, :width]
+    make = _kept_plate if len(text) <= _SHORT else _plate
+    plate = make(text, size or max(10, round(max(height, width) / 80)), colour)[:height, :width]
     left = min(max(corner[0], 0), width - plate.shape[1])
     top = corner[1] - plate.shape[0]
     if top < 0:
@@ -210,7 +210,6 @@ def draw_label(
     canvas[top : top + plate.shape[0], left : left + plate.shape[1]] = plate
 
 
-@functools.lru_cache(maxsize=4096)
 def _plate(text: str, size: int, colour: Colour) -> NDArray[np.uint8]:
     font = _font(size)
     left, _, right, _ = font.getbbox(text, anchor="ls")
@@ -221,6 +220,11 @@ def _plate(text: str, size: int, colour: Colour) -> NDArray[np.uint8]:
     ink = (0, 0, 0) if luminance > 110 else (255, 255, 255)
     ImageDraw.Draw(plate).text((margin - left, margin // 2 - above), text, fill=ink, font=font, anchor="ls")
     return np.asarray(plate, np.uint8)
+
+
+_SHORT: Final = 32
+"""Characters of a text that comes again and again, such as a box's; longer ones, of figures, are new in most frames."""
+_kept_plate = functools.lru_cache(maxsize=512)(_plate)
 
 
 @functools.lru_cache(maxsize=16)

@@ -85,6 +85,20 @@ def test_intervals_by_hand() -> None:
     assert ends == [(0, 1), (3, 4)]
 
 
+def test_a_track_that_changes_its_class_is_two(tmp_path: Path, video: list[Perception]) -> None:
+    boxes = video[1].boxes
+    assert boxes is not None
+    changed = dataclasses.replace(video[1], boxes=dataclasses.replace(boxes, class_id=1 - boxes.class_id))
+    objects = write(tmp_path, [video[0], changed])[0]["openlabel"]["objects"].values()
+    tracked = [
+        (one["type"], [interval["frame_start"] for interval in one["frame_intervals"]])
+        for one in objects
+        if one["type"] in video[0].class_names
+    ]
+    one, other = video[0].class_names
+    assert sorted(tracked) == sorted([(one, [0]), (other, [0]), (one, [1]), (other, [1])])
+
+
 def test_a_line_and_a_track_of_one_number_are_two_objects(tmp_path: Path, video: list[Perception], road: Road) -> None:
     boxes = video[0].boxes
     assert boxes is not None

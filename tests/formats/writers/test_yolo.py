@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from trilitenet.formats.writers.yolo import YoloWriter
 from trilitenet.structures import Perception
@@ -18,6 +19,13 @@ def test_lines_by_hand(tmp_path: Path, pictures: list[Perception]) -> None:
     # centre x (10.25 + 60) / 2 / 200, centre y (20 + 50.5) / 2 / 120, width 49.75 / 200, height 30.5 / 120
     assert lines[0] == "0 0.175625 0.293750 0.248750 0.254167 0.9000"
     assert lines[1].startswith("1 0.575000 ")
+
+
+def test_the_folder_is_that_of_the_file_wherever_it_is_read_from(tmp_path: Path, pictures: list[Perception]) -> None:
+    with YoloWriter(tmp_path) as writer:
+        writer.write(pictures[0])
+    told = yaml.safe_load((tmp_path / "data.yaml").read_text())
+    assert told.keys() == {"train", "val", "names"}  # "path: ." would be the current folder to Ultralytics
 
 
 def test_supervision_opens_it(tmp_path: Path, pictures: list[Perception]) -> None:

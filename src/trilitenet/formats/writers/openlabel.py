@@ -79,7 +79,8 @@ class _Document:
                 self._register(uid, frame, label, label)
                 data[uid] = {"object_data": {"image": [_image("mask", mask)]}}
         for found in objects(perception):
-            uid = self._uid(("box", found.track_id) if found.track_id >= 0 else None)
+            # An object has one type: a track that changes its class is one object a class.
+            uid = self._uid((f"box {found.name}", found.track_id) if found.track_id >= 0 else None)
             self._register(uid, frame, f"{found.name} {uid}", found.name)
             confidence = {"name": "confidence", "val": round(found.confidence, 4)}
             value = list(rounded(xyxy_to_cxcywh(found.corners)))

@@ -58,6 +58,6 @@ class YoloWriter(Writer):
         """Write ``data.yaml``."""
         if self._class_names is None:
             return
-        data = {"path": ".", "train": "images", "val": "images", "names": list(self._class_names)}
+        data = {"train": "images", "val": "images", "names": list(self._class_names)}  # from its own folder on
         self._class_names = None
         self.write_whole(self._data, yaml.safe_dump(data, sort_keys=False))
