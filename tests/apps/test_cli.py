@@ -377,6 +377,7 @@ def test_several_values_may_follow_one_option() -> None:
         ("data prepare --splits train val-2024 DIR OUT", "data prepare --splits train --splits val-2024 DIR OUT"),
         ("data prepare DIR --splits train night", "data prepare DIR --splits train --splits night"),
         ("data prepare --splits night val DIR OUT", "data prepare --splits night --splits val DIR OUT"),
+        ("data convert --splits val coco DIR OUT", "data convert --splits val coco DIR OUT"),
         ("data prepare DIR --splits test night test", "data prepare DIR --splits test --splits night --splits test"),
         ("predict --format json csv a.jpg", "predict --format json --format csv a.jpg"),
         ("predict --hide boxes labels a.jpg", "predict --hide boxes --hide labels a.jpg"),

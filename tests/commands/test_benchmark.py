@@ -317,7 +317,7 @@ def test_no_first_result_pays_for_importing_a_runtime(watch: Watch, monkeypatch:
     assert [backend.runs for backend in opened] == [0, 2, 2]
 
 
-def test_energy_is_told_only_where_it_was_read_each_time(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_energy_is_told_only_where_it_was_read_before_and_after(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trilitenet.commands.benchmark.load", lambda model, **_: Predictor(Taking(watch, [200] * 10)))
     for readings in ([1.0, 0.5], [1.0, None], [None, 1.0]):  # the counter began anew; it is gone; it was not there
         left = iter(readings)

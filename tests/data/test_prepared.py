@@ -288,8 +288,20 @@ def test_copies_of_remote_shards_are_of_one_state(root: Path, tmp_path: Path, ca
     for index, sample in enumerate(PreparedDataset(tmp_path / "out", "val")):
         np.testing.assert_array_equal(again[index].image, sample.image)
         np.testing.assert_array_equal(again[index].boxes, sample.boxes)
+    open_since = PreparedDataset(address, "train", cache=copies)
+    shutil.rmtree(tmp_path / "out")
+    prepare(root, tmp_path / "out", canvas=CANVAS, images="jpeg")
+    with pytest.raises(DataError, match=r"train-000000\.tar: was prepared anew since it was opened; begin again$"):
+        open_since[0]
+    anew = PreparedDataset(address, "val", cache=copies)
+    for index, sample in enumerate(PreparedDataset(tmp_path / "out", "val")):
+        np.testing.assert_array_equal(anew[index].image, sample.image)
+    (tmp_path / "out/prepared.json").write_text("<html>Sign in</html>")  # what answers is something else
+    np.testing.assert_array_equal(PreparedDataset(address, "val", cache=copies)[0].image, anew[0].image)
+    with pytest.raises(DataError, match=rf"^{address}/prepared\.json: cannot be read .*; prepare the data set again$"):
+        PreparedDataset(address, "val", cache=tmp_path / "no copies")
     shutil.rmtree(tmp_path / "out")  # as if the network were down
-    np.testing.assert_array_equal(PreparedDataset(address, "val", cache=copies)[0].image, again[0].image)
+    np.testing.assert_array_equal(PreparedDataset(address, "val", cache=copies)[0].image, anew[0].image)
     assert "going on with the copies" in caplog.text
 
 

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import collections
+import weakref
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,8 +49,12 @@ def test_the_cpu_is_refused() -> None:
 def test_few_shapes_are_captured_and_memory_is_made_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
     captured: list[tuple[int, ...]] = []
     room = [True]
+    tried: list[weakref.ref[Any]] = []
 
     def capture(self: CudaGraphBackend, network: object, shape: tuple[int, ...]) -> str:
+        large = np.zeros(1)  # what did not fit
+        assert not [held for held in tried if held() is not None]
+        tried.append(weakref.ref(large))
         if not room[0]:
             room[0] = True
             raise torch.OutOfMemoryError

@@ -78,8 +78,21 @@ def test_a_plain_script_needs_no_guard(tmp_path: Path) -> None:
     assert (done.stdout, done.stderr) == ("once\n[1, 2] True None\n", "")
 
 
+def test_a_guarded_script_may_hand_over_what_is_its_own(tmp_path: Path) -> None:
+    script = tmp_path / "guarded.py"
+    script.write_text(
+        "from trilitenet.processing.cores import ProcessPool\n"
+        "def twice(number): return 2 * number\n"
+        "if __name__ == '__main__':\n"
+        "    with ProcessPool(2) as pool:\n"
+        "        print(list(pool.map(twice, [1, 2])))\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True, timeout=60)
+    assert (done.stdout, done.stderr) == ("[2, 4]\n", "")
+
+
 def test_a_process_that_is_killed_is_one_line() -> None:
-    message = r"was ended, mostly for want of memory; lower --workers$"
+    message = r"was ended, mostly for want of memory; give fewer --workers, such as 1$"
     with pytest.raises(BackendError, match=message), ProcessPool(1) as pool:
         pool.submit(os._exit, 9).result()
 

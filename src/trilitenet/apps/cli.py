@@ -167,7 +167,7 @@ _LISTS: Final = {
     "--precisions": "fp32|fp16|bf16|int8",
     "--resolution": r"\d+",
     "--severities": r"\d+",
-    "--splits": rf"{_SPLIT}|[^-./\\][^./\\]*",
+    "--splits": rf"{_SPLIT}|(?!(bdd100k|coco|yolo|cvat|masks)$)[^-./\\][^./\\]*",
     "--tasks": "detection|drivable|lane",
     "--where": r"[\w.-]+=.+",
 }

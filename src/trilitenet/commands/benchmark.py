@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 import trilitenet
 from trilitenet.commands.energy import Meter, energy_meters
-from trilitenet.commands.load import check_parallel, load, own_builder
+from trilitenet.commands.load import BACKENDS, check_parallel, load, own_builder
 from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, one_for_several, optional_path
 from trilitenet.config import TASKS, VARIANTS, check_size
 from trilitenet.engine.provenance import peak_memory
@@ -33,7 +33,7 @@ from trilitenet.processing.cores import processor, usable_cores
 __all__ = ["Benchmark", "Cost", "Timing", "benchmark"]
 
 _PLOTS: Final = (".png", ".svg", ".pdf")
-_RUNTIMES: Final = frozenset({"torch", "onnxruntime", "openvino", "ncnn", "executorch", "tensorrt"})
+_RUNTIMES: Final = frozenset(BACKENDS) - {"auto"}
 _ENERGY_WINDOW: Final = 1.0
 """Seconds that each call is repeated for to measure its energy."""
 

@@ -119,7 +119,7 @@ def convert(
         kind: What the source is, if it is not the first word.
         classes: A YAML file with ``classes:`` (class name to categories), and for formats other than BDD100K what the
             other names and mask values mean; see docs/data.md.
-        splits: Convert these splits alone. They come after OUTPUT.
+        splits: Convert these splits alone. They come after the folders.
         lane_width: Width of lane markings in pixels of a 1280-pixel wide image, for all splits (``4``) or one
             (``train=8``); 8 for train and 2 for others if left out. Markings that come as masks keep theirs.
         crosswalk: Draw crosswalks as lane markings.

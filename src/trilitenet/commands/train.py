@@ -289,7 +289,7 @@ def _transform(config: TrainConfig, dataset: SampleSource, display: _Display) ->
             f"{config.teacher}: outputs are found by the image's name, and several images of the training data are "
             f"called {few(twice)}; give the images names of their own"
         )
-    if unmasked := sorted(lessons.unmasked() & names):
+    if "detection" in _taught(config) and (unmasked := sorted(lessons.unmasked() & names)):
         raise DataError(
             f"{config.teacher}: has boxes of {few(unmasked)} but no mask of the image; every image needs a mask (an "
             "empty one where nothing is predicted), or no image any"

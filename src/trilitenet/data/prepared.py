@@ -18,14 +18,15 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import http.client
 import io
 import json
 import logging
 import multiprocessing
 import os
 import re
-import shutil
 import tarfile
+import urllib.request
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
@@ -51,7 +52,16 @@ from trilitenet.data.reading import (
     split_folders,
 )
 from trilitenet.data.sample import BOXES, MASKS, VALID, Sample
-from trilitenet.errors import Claim, ConfigError, DataError, OutputError, import_extra, replacing, writing
+from trilitenet.errors import (
+    Claim,
+    ConfigError,
+    DataError,
+    MissingExtraError,
+    OutputError,
+    import_extra,
+    replacing,
+    writing,
+)
 from trilitenet.processing.cores import ProcessPool
 from trilitenet.processing.letterbox import Letterbox
 
@@ -65,6 +75,11 @@ FORMAT: Final = 1
 
 _LAYOUT: Final = 3
 """Shards of another layout are written anew."""
+
+_BY_SPLIT: Final = ("splits", "shards", "counts", "indexes")
+"""What ``prepared.json`` says of each split: hash of what it was made from, shards, number of images, hash of indexes."""
+_PATIENCE: Final = 10.0
+"""Seconds in which an address must answer."""
 
 _ENTRY: Final = frozenset({"name", "size", "boxes", "class_id", "ignored", "attributes", "parts"})
 """What every line of an index holds."""
@@ -284,6 +299,7 @@ class PreparedDataset:
         self._tasks = None if tasks is None else frozenset(tasks)
         self._lines: list[bytes] = []
         self._shard_of: list[int] = []
+        self._digests: list[str | None] = []
         self._shards: list[str] = state["shards"][split]
         for number, shard in enumerate(self._shards):
             lines = self._place.file(_index_name(shard)).read_bytes().splitlines()
@@ -291,6 +307,7 @@ class PreparedDataset:
                 raise DataError(f"{_index_name(shard)}: is empty; prepare the data set again")
             self._lines += lines
             self._shard_of += [number] * len(lines)
+            self._digests.append(_parse_entry(lines[0], _index_name(shard)).get("shard"))
         if len(self) != (prepared := state["counts"][split]):
             raise DataError(
                 f"{root}: the index of {split} holds {len(self)} images, not {prepared}; prepare the data set again"
@@ -329,7 +346,11 @@ class PreparedDataset:
     def fingerprint(self, index: int) -> str:
         """Return a hash of what the shard's index says of a sample: boxes, attributes, and the hash of its parts."""
         entry = self._entry(index)
-        entry.pop("made_from", None)  # when the files of the shard were written, which a copy of them is not
+        for of_the_shard in (
+            "made_from",
+            "shard",
+        ):  # when its files were written, which a copy of them is not; its hash
+            entry.pop(of_the_shard, None)
         return hashlib.sha256(json.dumps(entry).encode()).hexdigest()[:16]
 
     def _entry(self, index: int) -> dict[str, Any]:
@@ -342,7 +363,8 @@ class PreparedDataset:
             DataError: If its shard is missing or broken.
         """
         entry = self._entry(index)
-        path = self._place.file(self._shards[self._shard_of[index]])
+        number = self._shard_of[index]
+        path = self._place.file(self._shards[number], self._digests[number])
         shard = _map_shard(path)
         if _end(entry) > len(shard):
             raise DataError(f"{path}: is cut short; prepare the data set again")
@@ -381,8 +403,12 @@ class _Place:
     root: str
     cache: Path | None
 
-    def file(self, name: str) -> Path:
+    def file(self, name: str, digest: str | None = None) -> Path:
         """Return a file's path on this machine.
+
+        Args:
+            name: Its name.
+            digest: SHA-256 that a file must have to be copied.
 
         Raises:
             DataError: If it is not there.
@@ -394,7 +420,11 @@ class _Place:
             return path
         path = self.cache / name
         if not path.is_file():
-            _fetch(self.root, name, path)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with replacing(path) as part:
+                found = _fetch(self.root, name, part)
+                if digest not in (None, found):
+                    raise DataError(f"{self.root}/{name}: was prepared anew since it was opened; begin again")
         return path
 
 
@@ -410,26 +440,43 @@ def _open_place(root: str, split: str, cache: Path | None) -> tuple[_Place, dict
     if cache is None:
         raise DataError(f"{root}: give `cache`, a folder for copies of remote shards")
     path = cache / f"{hashlib.sha256(root.encode()).hexdigest()[:16]}.json"
+    cache.mkdir(parents=True, exist_ok=True)
     try:
-        _fetch(root, PREPARED_FILE, path)
-    except DataError as error:
+        with replacing(path) as part:
+            _fetch(root, PREPARED_FILE, part)
+            state = _read_state(part, f"{root}/{PREPARED_FILE}", "prepare the data set again")
+    except (DataError, MissingExtraError) as error:
         if not path.is_file():
             raise
         _LOGGER.warning("%s; going on with the copies of it in %s", error, cache)
-    state = _read_state(path)
-    key = json.dumps([root, state["splits"].get(split), state["canvas"], state["class_names"], state["mask_above"]])
-    folder = f"{split}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
-    return _Place(root, cache / folder), state
+        state = _read_state(path)
+    own = {key: value.get(split) if key in _BY_SPLIT else value for key, value in state.items()}
+    key = hashlib.sha256(json.dumps([root, own], sort_keys=True).encode()).hexdigest()[:16]
+    return _Place(root, cache / f"{split}-{key}"), state
 
 
-def _fetch(root: str, name: str, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    opener = import_extra("webdataset", "data").gopen
+def _fetch(root: str, name: str, path: Path) -> str:
+    """Copy a remote file, and return its SHA-256.
+
+    Raises:
+        DataError: If that fails.
+    """
+    url, digest = f"{root.rstrip('/')}/{name}", hashlib.sha256()
     try:
-        with replacing(path) as part, opener(f"{root.rstrip('/')}/{name}") as source, part.open("wb") as target:
-            shutil.copyfileobj(source, target)
-    except (OSError, ValueError) as error:
-        raise DataError(f"{root}/{name}: cannot be fetched ({error})") from error
+        with _remote(url, quick=name == PREPARED_FILE) as source, path.open("wb") as target:
+            while data := source.read(1 << 20):
+                target.write(data)
+                digest.update(data)
+    except (OSError, ValueError, http.client.HTTPException) as error:
+        raise DataError(f"{url}: cannot be fetched ({error})") from error
+    return digest.hexdigest()
+
+
+def _remote(url: str, *, quick: bool) -> Any:
+    """Open what is at an address; ``quick`` asks once, where WebDataset's own way tries for minutes."""
+    if quick and url.lower().startswith(("http://", "https://")):
+        return urllib.request.urlopen(url, timeout=_PATIENCE)
+    return import_extra("webdataset", "data").gopen(url)
 
 
 def _parse_entry(line: bytes, name: str) -> dict[str, Any]:
@@ -527,6 +574,7 @@ def _write_shard(plan: _Plan, split: str, number: int, names: list[str], add: Ca
                 add(1)
         _locate(part, entries)
         entries[0]["made_from"] = made_from
+        entries[0]["shard"] = _sha256(part)
         index_part.write_text("".join(json.dumps(entry) + "\n" for entry in entries), encoding="utf-8")
 
 
@@ -636,15 +684,15 @@ def _open_out(plan: _Plan) -> None:
         raise OutputError(f"{plan.out}: is not empty and not prepared earlier; choose another folder")
     plan.out.mkdir(parents=True, exist_ok=True)
     if not state.is_file():
-        _replace_state(plan, {"splits": {}, "shards": {}, "counts": {}})
+        _replace_state(plan, {part: {} for part in _BY_SPLIT})
 
 
 def _forget(plan: _Plan, splits: Iterable[str]) -> None:
     """Take splits whose shards may be written again out of the state, so that nobody reads a mixture."""
     there = _read_state(plan.out / PREPARED_FILE)
     for split in splits:
-        for part in ("splits", "shards", "counts"):
-            there[part].pop(split, None)
+        for part in _BY_SPLIT:
+            there.get(part, {}).pop(split, None)
     _replace_state(plan, there)
 
 
@@ -664,6 +712,8 @@ def _write_state(plan: _Plan, datasets: Mapping[str, SampleSource]) -> None:
                 (plan.out / name).unlink()
                 (plan.out / _index_name(name)).unlink(missing_ok=True)
         there["shards"][split] = kept
+        indexes = b"".join((plan.out / _index_name(name)).read_bytes() for name in kept)
+        there.setdefault("indexes", {})[split] = hashlib.sha256(indexes).hexdigest()
     _replace_state(plan, there)
 
 
@@ -673,17 +723,22 @@ def _replace_state(plan: _Plan, state: Mapping[str, Any]) -> None:
         part.write_text(text, encoding="utf-8")
 
 
-def _read_state(path: Path) -> dict[str, Any]:
-    cure = f"remove {path.parent} and prepare the data set again"
+def _read_state(path: Path, where: str = "", cure: str = "") -> dict[str, Any]:
+    """Read ``prepared.json``; ``where`` it is from and the ``cure`` are for messages.
+
+    Raises:
+        DataError: If it is broken.
+    """
+    where, cure = where or str(path), cure or f"remove {path.parent} and prepare the data set again"
     try:
         state: dict[str, Any] = parse_json(path.read_bytes())
     except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read ({error}); {cure}") from error
+        raise DataError(f"{where}: cannot be read ({error}); {cure}") from error
     found = state.get("format") if isinstance(state, dict) else None
     if found != FORMAT:
-        raise DataError(f"{path}: format {found!r}, not {FORMAT}; {cure}")
+        raise DataError(f"{where}: format {found!r}, not {FORMAT}; {cure}")
     if missing := {"canvas", "class_names", "mask_above", "splits", "shards", "counts"} - state.keys():
-        raise DataError(f"{path}: lacks {', '.join(sorted(missing))}; {cure}")
+        raise DataError(f"{where}: lacks {', '.join(sorted(missing))}; {cure}")
     return state
 
 
@@ -718,6 +773,14 @@ def _made_from(dataset: DrivingDataset) -> str:
         files.append(f"{IMAGE_FOLDER}/{dataset.split}/{dataset.image_path(index).name}")
         files += [label_file(task, dataset.split, name) for task in LABEL_FILES]
     return _digest(dataset.root, files)
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while data := file.read(1 << 20):
+            digest.update(data)
+    return digest.hexdigest()
 
 
 def _digest(root: Path, files: Iterable[str]) -> str:

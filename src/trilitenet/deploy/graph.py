@@ -293,7 +293,8 @@ class MaskGraph(nn.Module):
         self.up1 = UpStageGraph(head.up1, layout, self.columns.quarter)
         self.up2 = UpStageGraph(head.up2, layout, self.columns.half, layout.half, before)
         slopes = prelu_slopes(head.out.act, 2)
-        # Decided as the network's rounded probabilities are: between the highest that is not above and the next.
+        # Decided as the network's rounded probabilities are: between the highest that is not above and the next (at a
+        # threshold of 1, which none is above, from nearly 1 on).
         threshold = 0.5 if masks == "probability" else (mask_limit(threshold) + 0.5) / 255
         self.out: FusedConv | FusedTransposedConv
         self.difference, self.enlarge = nn.ModuleList(), nn.ModuleList()

@@ -16,7 +16,7 @@ import torch
 import yaml
 from torch import Tensor, nn
 
-from trilitenet.config import ModelCard
+from trilitenet.config import TASKS, ModelCard
 from trilitenet.data.batches import Batch
 from trilitenet.data.identity import tell_apart
 from trilitenet.data.loader import WORKER_LOST
@@ -587,6 +587,8 @@ class Trainer:
         state = read_checkpoint(path)
         ours, theirs = self.config.to_dict(), state["config"]
         ours["class count"], theirs["class count"] = self.network.classes, state["classes"]
+        if "tasks" in theirs:
+            theirs["tasks"] = [task for task in TASKS if task in theirs["tasks"]]  # as a run lists them now
         for name in (*SAME_ON_RESUME, "class count"):
             if theirs.get(name, ours[name]) != ours[name]:
                 raise WeightsError(

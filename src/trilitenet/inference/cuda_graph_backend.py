@@ -115,15 +115,18 @@ class CudaGraphBackend:
             return self._captured[shape]
         while len(self._captured) >= _SHAPES:
             self._captured.popitem(last=False)
+        made = None
         try:
-            self._captured[shape] = self._capture(network, shape)
+            made = self._capture(network, shape)
         except torch.OutOfMemoryError:
             if not self._captured:
                 raise
+        if made is None:  # outside of the clause above, in which the error holds what did not fit
             self._captured.clear()
             torch.cuda.empty_cache()
-            self._captured[shape] = self._capture(network, shape)
-        return self._captured[shape]
+            made = self._capture(network, shape)
+        self._captured[shape] = made
+        return made
 
     def _capture(self, network: Callable[[Tensor], Sequence[Tensor | None]], shape: tuple[int, ...]) -> _Captured:
         host = torch.zeros(shape, dtype=torch.uint8, pin_memory=True)

@@ -57,7 +57,7 @@ class ExportedTorchBackend(ArtefactBackend):
         self.device = pick_device("cpu" if device == "auto" else device)
         self._path = path
         if self.device.type != "cpu":  # the program makes tensors of its own, and checks where its inputs are
-            program = move_to_device_pass(program, str(self.device))
+            program = move_to_device_pass(program, str(torch.empty(0, device=self.device).device))  # with its number
         self._module: torch.nn.Module | None = program.module()
 
     def __reduce__(self) -> tuple[Any, ...]:

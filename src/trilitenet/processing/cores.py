@@ -6,6 +6,7 @@ import concurrent.futures
 import contextlib
 import multiprocessing
 import os
+import pickle
 import platform
 import re
 import signal
@@ -47,7 +48,7 @@ class ProcessPool(concurrent.futures.ProcessPoolExecutor):
 
     What a process is at is interrupted, so that it cleans up; what waits is forgotten. Processes whose own was killed
     end, too. OpenCV takes one thread in each. They do not run the caller's script again, which need not be guarded by
-    ``if __name__ == "__main__"``; so functions and classes of the script itself cannot be handed over.
+    ``if __name__ == "__main__"`` then, unless what they are given is of the script itself.
 
     Args:
         workers: How many.
@@ -58,6 +59,7 @@ class ProcessPool(concurrent.futures.ProcessPoolExecutor):
     def __init__(
         self, workers: int, initializer: Callable[..., object] | None = None, initargs: tuple[Any, ...] = ()
     ) -> None:
+        self._handed = (initializer, initargs)
         heeds = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN  # which a shell's background job does not
         super().__init__(
             workers,
@@ -68,8 +70,9 @@ class ProcessPool(concurrent.futures.ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> concurrent.futures.Future[T]:
         """Add a task."""
+        own = _is_of_script((self._handed, fn, args, kwargs))
         # A process that starts with this task holds SIGINT back, too, until it can do without a word.
-        with held_back(signal.SIGINT), _script_unseen():
+        with held_back(signal.SIGINT), contextlib.nullcontext() if own else _script_unseen():
             return super().submit(_interruptible, fn, *args, **kwargs)
 
     def __exit__(
@@ -78,20 +81,32 @@ class ProcessPool(concurrent.futures.ProcessPoolExecutor):
         self.shutdown(wait=True, cancel_futures=True)
         if isinstance(error, BrokenProcessPool):
             raise BackendError(
-                "a process that shared the work was ended, mostly for want of memory; lower --workers"
+                "a process that shared the work was ended, mostly for want of memory; give fewer --workers, such as 1"
             ) from error
+
+
+_hiding = threading.Lock()
+
+
+def _is_of_script(handed: object) -> bool:
+    """Return whether anything that is handed to a process is of the script that runs."""
+    try:
+        return b"__main__" in pickle.dumps(handed)
+    except Exception:
+        return False
 
 
 @contextlib.contextmanager
 def _script_unseen() -> Iterator[None]:
     """Hide from processes that start in the block which script to run first: see `multiprocessing.spawn`."""
     main = vars(sys.modules["__main__"])
-    hidden: dict[str, Any] = {name: main.pop(name) for name in ("__file__", "__spec__") if name in main}
-    main["__spec__"] = None
-    try:
-        yield
-    finally:
-        main.update(hidden)
+    with _hiding:
+        hidden: dict[str, Any] = {name: main.pop(name) for name in ("__file__", "__spec__") if name in main}
+        main["__spec__"] = None
+        try:
+            yield
+        finally:
+            main.update(hidden)
 
 
 @contextlib.contextmanager

@@ -292,7 +292,8 @@ class GuardedServer(uvicorn.Server):
         finally:
             log.removeFilter(unsaid)
         if service.failure is not None:
-            raise BackendError(f"{service.name}: cannot serve, the first image failed ({gist(service.failure)})")
+            reason = gist(service.failure) or type(service.failure).__name__
+            raise BackendError(f"{service.name}: cannot serve, the first image failed ({reason})")
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start, and say where."""
