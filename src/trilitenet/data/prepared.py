@@ -77,7 +77,7 @@ _LAYOUT: Final = 3
 """Shards of another layout are written anew."""
 
 _BY_SPLIT: Final = ("splits", "shards", "counts", "indexes")
-"""What ``prepared.json`` says of each split: hash of what it was made from, shards, number of images, hash of indexes."""
+"""What ``prepared.json`` says of a split: hash of what it was made from, shards, count of images, hash of indexes."""
 _PATIENCE: Final = 10.0
 """Seconds in which an address must answer."""
 

@@ -4,6 +4,7 @@ import base64
 import contextlib
 import io
 import json
+import struct
 import threading
 import time
 from collections.abc import Callable
@@ -302,6 +303,17 @@ def test_the_images_of_a_request_are_paid_for(make_app: MakeApp) -> None:
             answer = client.post("/v2/models/tiny/infer", **request)
             assert answer.status_code == status
     assert "memory" in answer.json()["error"]
+
+
+def test_what_follows_the_json_is_paid_for_twice(make_app: MakeApp, jpeg: bytes) -> None:
+    film = jpeg + bytes(60_000)  # few pixels, many bytes
+    request = _binary([1], struct.pack("<I", len(film)) + film, "BYTES")
+    app = make_app(memory=300_000, max_body=100_000, max_pixels=10_000)
+    with TestClient(app) as client:
+        for taken, status in ((120_000, 200), (180_000, 503)):  # by others; once would fit beside either
+            app.service.memory.take(taken)
+            assert client.post("/v2/models/tiny/infer", **request).status_code == status
+            app.service.memory.give(taken)
 
 
 def test_as_many_images_as_are_taken_at_once(client: TestClient) -> None:

@@ -5,6 +5,7 @@ import io
 import struct
 import zlib
 from collections.abc import AsyncIterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -206,6 +207,22 @@ def test_a_body_is_paid_for_as_it_arrives() -> None:
     reservation.budget.take(80)  # by others
     with pytest.raises(BusyError):
         asyncio.run(read_body(_pieces(b"12345", b"67890"), Reservation(reservation.budget), settings))
+
+
+def test_any_number_of_fill_bytes_is_passed_over_at_once() -> None:
+    data = encode(picture(61, 47), "JPEG")
+    seen = []
+
+    class Watched(bytes):
+        def __getitem__(self, place: Any) -> Any:
+            seen.append(place)
+            return super().__getitem__(place)
+
+    filled = Watched(data[:2] + b"\xff" * 1_000_000 + data[2:])
+    assert read_header(filled) == Header("JPEG", 61, 47, 1)
+    assert len(seen) < 1_000  # bytes looked at one by one
+    with pytest.raises(ProblemError, match="header"):
+        read_header(data[:2] + b"\xff" * 1_000)
 
 
 def test_endless_segments_are_refused() -> None:

@@ -40,6 +40,8 @@ def test_preamble_and_quoted_boundary() -> None:
         (_part("image", b"1") + b"--xyz--", "multipart/form-data; boundary=" + "x" * 300),
         (b"--" + b"x" * 201 + b"\r\n\r\n\r\n--" + b"x" * 201 + b"--", "multipart/form-data; boundary=" + "x" * 201),
         (b"--xyz\r\nno headers end\r\n" + _part("image", b"1") + b"--xyz--", TYPE),
+        (_part("image", b"1") + b"--xyz--", f'{TYPE}; x="{";" * 32_000}'),  # which would take a second to read
+        (_part("image", b"1", f'; x="{";" * 3_000}') + b"--xyz--", TYPE),
     ],
 )
 def test_broken_forms_are_refused(body: bytes, content_type: str) -> None:

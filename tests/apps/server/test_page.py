@@ -597,6 +597,49 @@ def test_the_camera_runs_until_it_is_stopped(page: Page, server: Running) -> Non
     assert not page["error"].is_displayed()
 
 
+def test_a_camera_that_is_lost_ends_the_job(page: Page, server: Running) -> None:
+    page.script(
+        "const real = navigator.mediaDevices.getUserMedia.bind(navigator.mediaDevices);"
+        "navigator.mediaDevices.getUserMedia = async (wanted) => (window.lent = await real(wanted))"
+    )
+    before = _counted(server, "/v1/predict")
+    page["camera"].click()
+    page.wait(lambda: _counted(server, "/v1/predict") >= before + 2)
+    page.script("for (const track of window.lent.getTracks()) track.stop()")
+    page.wait(lambda: page["error"].text == "The camera is gone.")
+    assert not page["stop"].is_displayed()
+
+
+def test_the_camera_shows_nothing_of_the_clip_before_it(page: Page, server: Running, clip: Path) -> None:
+    page.script("document.getElementById('rate').value = '10'")
+    page.choose(clip)
+    page.wait(lambda: page["progress-row"].is_displayed())
+    assert not page["save-clip"].is_enabled()  # until all of it has been seen
+    before = _counted(server, "/v1/predict")
+    page["camera"].click()
+    page.wait(lambda: _counted(server, "/v1/predict") >= before + 2)
+    assert not page["progress-row"].is_displayed()
+    assert page.script("return document.body.getAttribute('aria-busy')") is None
+    page["stop"].click()
+    page.wait(lambda: not page["stop"].is_displayed())
+
+
+def test_waiting_leaves_nothing_behind(page: Page) -> None:
+    left = page.driver.execute_async_script(
+        "const [done] = arguments; const stop = new AbortController(); let count = 0;"
+        "for (const [name, step] of [['addEventListener', 1], ['removeEventListener', -1]]) {"
+        "  const real = stop.signal[name].bind(stop.signal);"
+        "  stop.signal[name] = (...all) => { count += step; return real(...all); };"
+        "}"
+        "import(new URL('client.js', document.baseURI)).then(async ({ pause }) => {"
+        "  for (let i = 0; i < 5; i += 1) await pause(1, stop.signal);"
+        "  const rest = count; const last = pause(1e6, stop.signal).catch((error) => done([rest, error.name]));"
+        "  stop.abort();"
+        "}, (error) => done(String(error)))"
+    )
+    assert left == [0, "AbortError"]
+
+
 def test_a_dropped_photo_is_taken(page: Page, photo: Path) -> None:
     page.script(
         "const bytes = Uint8Array.from(arguments[0]); const transfer = new DataTransfer();"

@@ -2,13 +2,17 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import gc
 import io
 import json
+import threading
 import time
+import weakref
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 from starlette.testclient import TestClient
 
@@ -20,7 +24,7 @@ from trilitenet.apps.server.openapi import BatchPrediction, Prediction, Protocol
 from trilitenet.config import ArtefactInfo
 from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.drawing import DRIVABLE_COLOUR, LANE_COLOUR
-from trilitenet.structures import Perception
+from trilitenet.structures import Perception, RawOutputs
 
 
 def test_predict_takes_a_body_or_a_form_and_answers_alike(client: TestClient, jpeg: bytes) -> None:
@@ -315,6 +319,51 @@ def test_the_schema_describes_every_route_with_examples(app: Application) -> Non
     BatchPrediction.model_validate(batch["responses"]["200"]["content"]["application/json"]["example"])
     assert "multipart/form-data" in predict["requestBody"]["content"]
     assert "Retry-After" in predict["responses"]["503"]["headers"]
+
+
+def test_a_failure_ends_the_rest_of_a_batch(make_app: MakeApp, backend: FakeBackend, jpeg: bytes) -> None:
+    plain, runs = backend.run, []
+
+    def run(batch: NDArray[np.uint8]) -> RawOutputs:
+        runs.append(len(batch))
+        if len(runs) == 2:  # the first is the start's
+            raise RuntimeError("broken")
+        time.sleep(0.1)
+        return plain(batch)
+
+    backend.run = run  # type: ignore[method-assign]
+    with TestClient(make_app(max_batch=1), raise_server_exceptions=False) as client:
+        answer = client.post("/v1/predict/batch", files=[("images", ("a", jpeg))] * 12)
+        assert answer.status_code == 500
+        seen = len(runs)
+        assert client.post("/v1/predict", content=jpeg).status_code == 200  # behind what is still in work
+    assert len(runs) <= seen + 3
+
+
+def test_nothing_is_kept_of_work_that_nobody_waits_for(make_app: MakeApp) -> None:
+    class Body:
+        """Stands for an image's bytes."""
+
+    service, gate = make_app(threads=1).service, threading.Event()
+
+    async def leave() -> weakref.ref[Body]:
+        first = asyncio.ensure_future(service.in_pool(gate.wait))  # the one thread is busy
+        body = Body()
+        held = weakref.ref(body)
+        second = asyncio.ensure_future(service.in_pool(print, body))
+        del body
+        await asyncio.sleep(0.05)
+        assert held() is not None
+        second.cancel()
+        await asyncio.gather(second, return_exceptions=True)
+        del second
+        gc.collect()
+        assert held() is None
+        gate.set()
+        assert await first
+        return held
+
+    asyncio.run(leave())
 
 
 def test_a_batch_beyond_all_memory_refuses_what_does_not_fit(make_app: MakeApp) -> None:

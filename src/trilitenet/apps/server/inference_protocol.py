@@ -112,6 +112,7 @@ def protocol_router(service: Service) -> APIRouter:
         reservation = request.scope["state"]["reservation"]
         body = await read_request(request, service, reservation)
         split = _json_length(request.headers.get(_HEADER_LENGTH), len(body))
+        reservation.take(len(body) - split)  # what follows the JSON is copied
         reservation.take(await service.in_pool(_json_memory, body, split))
 
         async def work(deadline: float) -> Response:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import re
 import struct
 import threading
 from collections.abc import AsyncIterator
@@ -26,6 +27,7 @@ from trilitenet.processing.images import read_image
 __all__ = ["Header", "MemoryBudget", "Reservation", "check_header", "decode", "read_header"]
 
 _MAX_SEGMENTS: Final = 1_000
+_FILL: Final = re.compile(rb"\xff+")
 """Segments of a JPEG, of which its header, metadata and scans are made; each costs 10 microseconds."""
 
 Kind = Literal["JPEG", "PNG", "WEBP"]
@@ -121,8 +123,8 @@ def _jpeg(data: bytes) -> Header:
     for _ in range(_MAX_SEGMENTS):
         if data[position] != 0xFF:
             raise ProblemError(422, "broken_image", "the JPEG image has a broken header")
-        while data[position] == 0xFF:
-            position += 1
+        fill = _FILL.match(data, position)
+        position = position + 1 if fill is None else fill.end()
         marker = data[position]
         position += 1
         if marker in {0xD8, 0x01} or 0xD0 <= marker <= 0xD7:

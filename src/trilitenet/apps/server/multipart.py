@@ -15,6 +15,8 @@ __all__ = ["Part", "split_form"]
 
 _MAX_HEADERS: Final = 4096
 """Bytes of the headers of one part."""
+_MAX_HEADER: Final = 1024
+"""Characters of a header with parameters, which take quadratic time to read."""
 
 
 class Part(NamedTuple):
@@ -40,7 +42,7 @@ def split_form(body: bytes, content_type: str, max_parts: int) -> list[Part]:
     Raises:
         ProblemError: 400 if the body is not such a form or ends early, 413 if it has too many parts.
     """
-    boundary = _parameter("content-type", content_type, "boundary")
+    boundary = _parameter("Content-Type", content_type, "boundary")
     if not boundary or len(boundary) > 200:
         raise ProblemError(400, "bad_form", "the multipart form names no boundary in its Content-Type")
     delimiter = b"\r\n--" + boundary.encode("latin-1", "replace")
@@ -68,11 +70,15 @@ def _field_name(headers: bytes) -> str:
     for line in headers.split(b"\r\n"):
         name, _, value = line.partition(b":")
         if name.strip().lower() == b"content-disposition":
-            return _parameter("content-disposition", value.decode("utf-8", "replace"), "name")
+            return _parameter("Content-Disposition", value.decode("utf-8", "replace"), "name")
     return ""
 
 
 def _parameter(header: str, value: str, name: str) -> str:
+    if len(value) > _MAX_HEADER:
+        raise ProblemError(
+            400, "bad_form", f"a {header} of the multipart form is longer than {_MAX_HEADER:,} characters"
+        )
     message = Message()
     message[header] = value.replace("\r", " ").replace("\n", " ").strip()
     try:

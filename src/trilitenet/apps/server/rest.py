@@ -77,7 +77,12 @@ def rest_router(service: Service) -> APIRouter:
                         service.admission.skip()
                     return _refusal(problem)
 
-            results = await until_vanished(request, asyncio.gather(*map(settle, images)))
+            tasks = [asyncio.ensure_future(settle(image)) for image in images]
+            try:
+                results = await until_vanished(request, asyncio.gather(*tasks))
+            finally:
+                for task in tasks:  # the first that fails otherwise than by a problem of its own ends them all
+                    task.cancel()
         if all(result["status"] == 503 for result in results):
             raise BusyError(**{name: results[0]["error"][name] for name in ("code", "message")})
         for result in results:

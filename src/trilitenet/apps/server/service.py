@@ -155,8 +155,15 @@ class Service:
             self.admission.leave(count)
 
     async def in_pool(self, function: Callable[..., _T], *arguments: Any) -> _T:
-        """Run something slow that comes before the network, off the event loop."""
-        return await asyncio.get_running_loop().run_in_executor(self._intake, function, *arguments)
+        """Run something slow that comes before the network, off the event loop.
+
+        Of what nobody waits for any longer nothing is kept, though its turn may be far.
+        """
+        handed = [arguments]
+        del arguments
+        future = asyncio.get_running_loop().run_in_executor(self._intake, lambda: function(*handed.pop()))
+        future.add_done_callback(lambda _: handed.clear())
+        return await future
 
     async def see(
         self,

@@ -160,6 +160,9 @@ async function run(job) {
   work = mine;
   showError("");
   element("stop").hidden = false;
+  element("progress-row").hidden = true; // of the job before
+  document.body.removeAttribute("aria-busy");
+  element("save-clip").disabled = true; // until all of a clip has been seen
   try {
     await (met ??= meet());
     mine.signal.throwIfAborted();
@@ -167,7 +170,7 @@ async function run(job) {
     tokenSent = false;
   } catch (error) {
     if (work === mine) tellCurrent();
-    if (error.name === "AbortError") return;
+    if (mine.signal.aborted) return; // whatever it ended with: something newer is shown
     if (error instanceof ServiceError && error.status === 401) {
       if (tokenSent) showError("The service does not take this token.");
       tokenSent = false;
@@ -183,6 +186,7 @@ async function run(job) {
       element("stop").hidden = true;
       element("progress-row").hidden = true;
       document.body.removeAttribute("aria-busy");
+      element("save-clip").disabled = false;
     }
   }
 }
@@ -234,9 +238,9 @@ async function seeClip(file, name, signal) {
     bar.value = frames.length / frame.count;
     element("progress-text").textContent = `Frame ${frames.length} of ${frame.count}`;
     showPlayer();
-    await showFrame(frames.length - 1, false);
+    if (!player) await showFrame(frames.length - 1, false);
   }
-  await showFrame(0);
+  if (!player) await showFrame(0);
 }
 
 async function seeCamera(signal) {
@@ -314,7 +318,7 @@ async function saveClip() {
   else showError("The clip was not saved, as something else was opened.");
   player = null;
   button.textContent = "Save clip";
-  for (const control of controls) control.disabled = false;
+  for (const control of controls) control.disabled = control === button && work !== null;
 }
 
 // ---------------------------------------------------------------------------------------------- wiring

@@ -34,12 +34,14 @@ async function shrink(source, width, height, longest, quality) {
 }
 
 function once(target, event, signal) {
+  const over = new AbortController(); // takes all listeners away, that of the signal too
   return new Promise((resolve, reject) => {
     signal?.throwIfAborted(); // a signal that has gone off already tells nobody again
-    target.addEventListener(event, resolve, { once: true, signal });
-    target.addEventListener("error", () => reject(new Error("This clip cannot be played here.")), { once: true, signal });
-    signal?.addEventListener("abort", () => reject(new DOMException("stopped", "AbortError")), { once: true });
-  });
+    const listening = { once: true, signal: over.signal };
+    target.addEventListener(event, resolve, listening);
+    target.addEventListener("error", () => reject(new Error("This clip cannot be played here.")), listening);
+    signal?.addEventListener("abort", () => reject(new DOMException("stopped", "AbortError")), listening);
+  }).finally(() => over.abort());
 }
 
 /** Yield { blob, picture, index, count, time, seconds } for frames of a clip `seconds` long, `rate` a second. */
@@ -92,6 +94,7 @@ export async function* openCamera(signal) {
     video.srcObject = stream;
     await video.play();
     while (!signal.aborted) {
+      if (stream.getVideoTracks().every((track) => track.readyState === "ended")) throw new Error("The camera is gone.");
       if (video.videoWidth) yield await shrink(video, video.videoWidth, video.videoHeight, LONGEST.camera, 0.85);
       await pause(15, signal);
     }
