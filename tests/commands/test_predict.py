@@ -223,6 +223,23 @@ def test_a_camera_file_is_read_once(tmp_path: Path, predictor: Predictor, monkey
     assert (report.images, read) == (3, [Path("camera.yaml")])
 
 
+def test_what_is_assumed_of_the_camera_reaches_the_monitor_or_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor = RoadOptions(measure=True, field_of_view=100.0, lane_width=3.75).open(still=False)[1]
+    assert monitor is not None
+    assert monitor._assumed == (100.0, 3.75)
+    monitor = RoadOptions(measure=True).open(still=True)[1]
+    assert monitor is not None
+    assert monitor._assumed == (60.0, 3.5)
+    for options, told in (
+        (RoadOptions(field_of_view=100.0), "--field-of-view would change nothing: it is for --road"),
+        (RoadOptions(camera="c.yaml", lane_width=3.0), "--lane-width would change nothing: the camera file says it"),
+        (RoadOptions(measure=True, field_of_view=180.0), "between 1 and 179 degrees, got 180"),
+        (RoadOptions(measure=True, lane_width=0.0), "lane width must be above 0 metres"),
+    ):
+        with pytest.raises(ConfigError, match=told):
+            options.open(still=False)
+
+
 def test_a_video(tmp_path: Path, predictor: Predictor) -> None:
     source, output = drive(tmp_path / "drive.mp4"), tmp_path / "out"
     report = predict_with(predictor, [source], output, format=("json", "jsonl"))

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 import pytest
@@ -176,6 +178,53 @@ def test_late_frames_leave_the_closing_speed_alone() -> None:
     other = LeadVehicle(0, 9, Estimate(5.0, 1.0))
     assert leads.update(other, boxes, 57.5 / 25, camera) is other  # late, and another vehicle: passed on as it is
     assert leads.update(lead, boxes, 60 / 25, camera).closing_speed is not None  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("rate", [5, 25, 60])
+@pytest.mark.parametrize("braking", [2.0, 4.0])
+def test_the_error_of_a_closing_speed_holds_while_the_lead_brakes(rate: int, braking: float) -> None:
+    leads, boxes = LeadFilter(), standing((40.0, 0.0))
+    for frame in range(4 * rate + 1):
+        since = max(0.0, frame / rate - 2)
+        distance = 40 - braking * since**2 / 2
+        found = leads.update(LeadVehicle(0, 3, Estimate(distance, 0.5)), boxes, frame / rate, CAMERA)
+    assert found is not None
+    assert found.closing_speed is not None
+    assert abs(found.closing_speed.value - 2 * braking) < 2 * found.closing_speed.error
+    assert found.closing_speed.error < LeadFilter.MAX_SPEED_ERROR
+
+
+def test_a_bump_is_not_taken_for_speed() -> None:
+    boxes = standing((30.0, 0.0))
+    told: dict[bool, list[float]] = {True: [], False: []}
+    for marked, speeds in told.items():
+        leads = LeadFilter()
+        for frame in range(80):
+            off = 4.0 * math.sin((frame - 50) / 3) if 50 <= frame < 60 else 0.0  # of a pitch that the lanes show
+            lead = LeadVehicle(0, 3, Estimate(30 + off, 0.5))
+            found = leads.update(lead, boxes, frame / 25, CAMERA, abs(off) if marked else 0.0)
+            if found is not None and found.closing_speed is not None:
+                speeds.append(abs(found.closing_speed.value) / found.closing_speed.error)
+    assert max(told[False]) > 3
+    assert max(told[True]) < 1.2
+
+
+def test_frames_exactly_a_gap_apart_tell_a_speed() -> None:
+    leads, boxes = LeadFilter(), standing((30.0, 0.0))
+    told = []
+    for frame in range(36):
+        found = leads.update(LeadVehicle(0, 3, Estimate(30.0, 0.1)), boxes, frame * 15 / 25, CAMERA)
+        assert found is not None
+        told.append(found.closing_speed is not None)
+    assert all(told[3:])
+
+
+def test_a_camera_that_may_be_tilted_makes_offsets_less_sure() -> None:
+    plain, tilted = (fit_ego_lane(line_at(1.8), line_at(-1.8), CAMERA, CameraErrors(roll=roll)) for roll in (0.0, 0.02))
+    assert plain is not None
+    assert tilted is not None
+    share = 0.02 * CAMERA.height * (1 + (1.8 / CAMERA.height) ** 2)
+    assert offset_of(tilted.lane).error == pytest.approx(math.hypot(offset_of(plain.lane).error, share), rel=0.02)
 
 
 def test_what_one_frame_alone_errs_by_is_not_kept() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from importlib import resources
@@ -16,7 +17,7 @@ from trilitenet.errors import ShapeError
 from trilitenet.processing.geometry import Camera
 from trilitenet.road.camera import CameraErrors
 from trilitenet.road.monitor import RoadMonitor
-from trilitenet.road.structures import Road
+from trilitenet.road.structures import EgoLane, Road
 from trilitenet.road.tracking import Steady
 from trilitenet.structures import Perception
 
@@ -197,26 +198,58 @@ def test_with_tracks_the_lead_keeps_its_number(drive: tuple[Scene, ...], perceiv
     assert len(set(tracks[4:])) == 1
 
 
+def marked(camera: Camera, *sides: float) -> Perception:
+    """Draw straight lines so many metres to the left."""
+    ahead = np.linspace(4.5, 60.0, 200)
+    mask = np.zeros(camera.size, np.uint8)
+    for side in sides:
+        pixels = camera.to_pixels(np.stack([ahead, np.full_like(ahead, side)], axis=1))
+        cv2.polylines(mask, [np.round(pixels).astype(np.int32)], False, 1, 3)
+    return Perception(camera.size, lane=mask > 0)
+
+
 def test_with_one_line_in_sight_the_lane_has_the_width_from_before() -> None:
     camera = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03)
-    ahead = np.linspace(4.5, 60.0, 200)
-
-    def picture(*sides: float) -> Perception:
-        mask = np.zeros(camera.size, np.uint8)
-        for side in sides:
-            pixels = camera.to_pixels(np.stack([ahead, np.full_like(ahead, side)], axis=1))
-            cv2.polylines(mask, [np.round(pixels).astype(np.int32)], False, 1, 3)
-        return Perception(camera.size, lane=mask > 0)
-
     monitor = RoadMonitor(camera)
     for _ in range(5):
-        monitor(picture(1.8, -1.8))
-    lane = monitor(picture(1.8)).ego_lane
+        monitor(marked(camera, 1.8, -1.8))
+    lane = monitor(marked(camera, 1.8)).ego_lane
     assert lane is not None
     assert lane.width is not None
     assert lane.width.value == pytest.approx(3.6, abs=0.15)
     for frame in range(60):  # the vehicle moves 0.3 m towards the line that is seen
-        lane = monitor(picture(1.8 - min(frame, 30) * 0.01)).ego_lane
+        lane = monitor(marked(camera, 1.8 - min(frame, 30) * 0.01)).ego_lane
     assert lane is not None
     assert lane.offset is not None
     assert lane.offset.value == pytest.approx(0.3, abs=0.1)
+
+
+@pytest.mark.parametrize("rate", [1, 5, 25])
+def test_the_width_of_a_lane_is_learnt_and_forgotten_by_time(rate: int) -> None:
+    camera = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03)
+    monitor = RoadMonitor(camera)
+    now = 0.0
+
+    def see(seconds: float, *sides: float) -> EgoLane | None:
+        nonlocal now
+        road = None
+        for _ in range(max(1, round(seconds * rate))):
+            road = monitor(dataclasses.replace(marked(camera, *sides), timestamp=now))
+            now += 1 / rate
+        assert road is not None
+        return road.ego_lane
+
+    see(4, 1.9, -1.9)
+    see(3, 1.4, -1.4)  # the road narrows
+    lane = see(1 / rate, -1.4)
+    assert lane is not None
+    assert lane.width is not None
+    assert lane.width.value == pytest.approx(2.8, abs=0.15)
+    sure = lane.width.error
+    lane = see(10, -1.4)
+    assert lane is not None
+    assert lane.width is not None
+    assert lane.width.error > sure + 0.03
+    now += 600  # another road
+    lane = see(1 / rate, -1.4)
+    assert lane is None or (lane.width, lane.offset) == (None, None)

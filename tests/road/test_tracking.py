@@ -51,12 +51,12 @@ def test_a_vehicle_that_fades_keeps_its_number_and_a_lost_one_does_not_return() 
     assert int(again.track_id[0]) != number
 
 
-@pytest.mark.parametrize("then", [3600.0, 1.3, 0.0])
+@pytest.mark.parametrize("then", [3600.0, 2.3, 0.0])
 def test_no_track_outlives_a_leap_in_time(then: float) -> None:
     pytest.importorskip("edgefirst.tracker")
     tracker = VehicleTracker(memory=1.0)
     for frame in range(5):
-        before = tracker.update(boxes(100.0), frame / 30)
+        before = tracker.update(boxes(100.0), 1 + frame / 30)
     assert before.track_id is not None
     numbers = set[int]()
     for frame in range(5):
@@ -65,6 +65,18 @@ def test_no_track_outlives_a_leap_in_time(then: float) -> None:
         numbers |= set(after.track_id.tolist())
     assert numbers - {-1}
     assert int(before.track_id[0]) not in numbers
+
+
+def test_a_late_frame_has_no_identity_and_ends_none() -> None:
+    pytest.importorskip("edgefirst.tracker")
+    tracker = VehicleTracker(memory=1.0)
+    seen = []
+    for frame in (0, 1, 2, 4, 3, 5, 6):
+        after = tracker.update(boxes(100.0), 1 + frame / 30)
+        assert after.track_id is not None
+        seen.append(int(after.track_id[0]))
+    assert seen[4] == -1
+    assert seen[3] == seen[5] == seen[6] > 0
 
 
 def test_times_out_of_range_are_refused() -> None:

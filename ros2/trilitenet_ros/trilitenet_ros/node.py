@@ -51,7 +51,11 @@ class PerceptionNode(Node):
             backend=self._parameter("backend", "auto"),
             confidence=None if confidence < 0 else confidence,
         )
-        self._monitor = RoadMonitor(read_camera(camera_file) if camera_file else None)
+        self._monitor = RoadMonitor(
+            read_camera(camera_file) if camera_file else None,
+            field_of_view=self._parameter("field_of_view", 60.0),
+            lane_width=self._parameter("lane_width", 3.5),
+        )
         self._start: float | None = None
         self._frame = 0
         self._detections = self.create_publisher(Detection2DArray, "~/detections", 1)

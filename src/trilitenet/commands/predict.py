@@ -11,7 +11,7 @@ import re
 import time
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path, PurePath
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -67,24 +67,39 @@ class RoadOptions:
         camera: A camera file (see `trilitenet.road.camera.read_camera`); estimated from the lanes if None.
         track: Give vehicles identities.
         smoothing: Weight of the past in the masks, in [0, 1).
+        field_of_view: Horizontal field of view in degrees that is assumed without a camera file; 60 if None.
+        lane_width: Metres between the lines of a lane, likewise; 3.5 if None.
     """
 
     measure: bool = False
     camera: StrPath | None = None
     track: bool = False
     smoothing: float = 0.0
+    field_of_view: float | None = None
+    lane_width: float | None = None
 
     def open(self, *, still: bool) -> tuple[Steady | None, RoadMonitor | None]:
         """Return what follows one video, or what looks at one picture.
 
         Raises:
-            ConfigError: If the camera file is wrong, or the smoothing out of range.
+            ConfigError: If the camera file is wrong, a number out of range, or an assumption without effect.
             MissingExtraError: If vehicles shall be tracked and the extra ``track`` is not installed.
         """
+        assumed: dict[str, Any] = {
+            name: value
+            for name, value in (("field_of_view", self.field_of_view), ("lane_width", self.lane_width))
+            if value is not None
+        }
+        if assumed and (self.camera is not None or not self.measure):
+            names = " and ".join(f"--{name.replace('_', '-')}" for name in assumed)
+            why = "the camera file says it" if self.camera is not None else "it is for --road"
+            raise ConfigError(f"{names} would change nothing: {why}; leave it out")
         steady = None
         if not still and (self.track or self.smoothing):
             steady = Steady(track=self.track, smoothing=self.smoothing)
-        return steady, RoadMonitor(self._mounted, still=still) if self.measure or self._mounted is not None else None
+        if not self.measure and self._mounted is None:
+            return steady, None
+        return steady, RoadMonitor(self._mounted, still=still, **assumed)
 
     @functools.cached_property
     def _mounted(self) -> Camera | None:
@@ -173,6 +188,8 @@ def predict(
     camera: StrPath | None = None,
     track: bool = False,
     smoothing: float = 0.0,
+    field_of_view: float | None = None,
+    lane_width: float | None = None,
 ) -> PredictReport:
     """Find vehicles, drivable area and lane lines in pictures, folders, videos and streams.
 
@@ -214,6 +231,9 @@ def predict(
             a video.
         track: Give vehicles an identity over the frames of a video.
         smoothing: Weight of the past in a video's masks, from 0 (none) to below 1.
+        field_of_view: For --road without a camera file: the lens's horizontal field of view in degrees; 60 if left out.
+            Many dash-cams have 100 to 140, of which their pictures' edges are bent.
+        lane_width: For --road without a camera file: metres between the lines of a lane; 3.5 if left out.
 
     Returns:
         What was done.
@@ -222,7 +242,7 @@ def predict(
         ConfigError: If an option is out of range, or not possible beside another.
         OutputError: If results exist and may not be replaced (told before the work begins), or cannot be written.
     """
-    options = RoadOptions(road, camera, track, smoothing)
+    options = RoadOptions(road, camera, track, smoothing, field_of_view, lane_width)
     options.open(still=False)  # what is wrong with them is told before any work
     clip = Clip(every=every, start=start, end=end, max_frames=max_frames)
     job = _Job(

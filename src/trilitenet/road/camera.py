@@ -32,12 +32,14 @@ class CameraErrors:
         yaw: Radians.
         height: Share of the height.
         focal: Share of the focal length.
+        roll: Radians.
     """
 
     pitch: float = 0.002
     yaw: float = 0.002
     height: float = 0.01
     focal: float = 0.005
+    roll: float = 0.002
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,7 +162,9 @@ class SelfCalibration:
     frames agree.
 
     The focal length cannot be seen from lanes: it follows from the assumed field of view, and its uncertainty goes into
-    every distance. Offsets across the lane do not depend on it.
+    every distance. Offsets across the lane do not depend on it. Roll is taken to be 0, and lines to be straight: what a
+    camera is tilted to the side by goes into offsets, for which their error has a share; a clip all of a bend is
+    calibrated with a part of it as yaw.
 
     Args:
         size: (height, width) of the pictures in pixels.
@@ -177,12 +181,14 @@ class SelfCalibration:
     """Standard deviation of the assumed focal length, as a share."""
     WIDTH_ERROR: Final = 0.06
     """Standard deviation of the assumed lane width, as a share."""
+    ROLL_ERROR: Final = 0.02
+    """Standard deviation of the roll, which is taken to be 0, in radians."""
 
     def __init__(
         self, size: tuple[int, int], *, field_of_view: float = 60.0, lane_width: float = 3.5, still: bool = False
     ) -> None:
-        if not lane_width > 0:
-            raise ConfigError(f"lane width must be positive, got {lane_width}")
+        if not 0 < lane_width < math.inf:
+            raise ConfigError(f"lane width must be above 0 metres, got {lane_width}")
         self.size, self.lane_width, self.still = size, lane_width, still
         self._level = Camera.from_field_of_view(size, field_of_view, 1.0)
         self._points: deque[tuple[float, float, float]] = deque(maxlen=self.WINDOW)
@@ -231,7 +237,7 @@ class SelfCalibration:
             return
         self.camera = dataclasses.replace(self._level, height=mounted, pitch=pitch, yaw=yaw)
         yaw_error = float(scatter[0]) / focal + (0.02 if self.still else 0.003)
-        self.errors = CameraErrors(pitch_error, yaw_error, self.WIDTH_ERROR, self.FOCAL_ERROR)
+        self.errors = CameraErrors(pitch_error, yaw_error, self.WIDTH_ERROR, self.FOCAL_ERROR, self.ROLL_ERROR)
 
 
 @dataclasses.dataclass(frozen=True)

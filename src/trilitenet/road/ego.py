@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from trilitenet.processing.boxes import box_iou
 from trilitenet.processing.geometry import Camera
 from trilitenet.road.camera import CameraErrors
-from trilitenet.road.structures import EgoLane, Estimate, GroundCurve, LaneLine, LeadVehicle
+from trilitenet.road.structures import LATE, EgoLane, Estimate, GroundCurve, LaneLine, LeadVehicle
 from trilitenet.structures import Boxes
 
 __all__ = [
@@ -189,8 +189,8 @@ def fit_ego_lane(
         shift = half / cos if usable[0][0] == "right" else -half / cos
         middle, middle_error = float(solution[0]) + shift, math.hypot(side_error, known_width.error)
     seen = np.array([-(middle or 0.0) * cos, -math.atan(slope), bend * cos**3])
-    of_camera = _camera_shares(seen, errors, camera, float(x.min()))
-    lasting = of_camera if usual is None else np.minimum(of_camera, _camera_shares(seen, usual, camera, float(x.min())))
+    shares = [_camera_shares(seen, one, camera, float(x.min()), half) for one in (errors, usual or errors)]
+    of_camera, lasting = shares[0], np.minimum(*shares)
     offset = curvature = None
     inside = middle is None or abs(float(seen[0])) < half + MAX_OUTSIDE
     if middle is not None and inside:  # else these are not the lines of the lane that the vehicle is in
@@ -220,12 +220,21 @@ def fit_ego_lane(
     return LaneFit(EgoLane(width, offset, heading, curvature), centre, half, seen if inside else None, spread, lasting)
 
 
-def _camera_shares(seen: Floats, errors: CameraErrors, camera: Camera, near: float) -> Floats:
-    """Return the standard deviations of offset, heading and curvature that the camera's errors make."""
+def _camera_shares(seen: Floats, errors: CameraErrors, camera: Camera, near: float, half: float) -> Floats:
+    """Return the standard deviations of offset, heading and curvature that the camera's errors make.
+
+    Args:
+        seen: Offset, heading and curvature.
+        errors: Of the camera.
+        camera: The camera.
+        near: Metres ahead at which the lines begin to be seen.
+        half: Half the lane's width in metres; 0 where it is not known.
+    """
     offset, _, curvature = seen.tolist()
+    lever = camera.height * (1 + (half / camera.height) ** 2)  # by which a roll moves lines so far to either side
     return np.array(
         [
-            math.hypot(offset * errors.height, (errors.yaw + errors.pitch) * near),
+            math.hypot(offset * errors.height, (errors.yaw + errors.pitch) * near, errors.roll * lever),
             math.hypot(errors.yaw, errors.pitch * offset / camera.height),
             abs(curvature) * (errors.focal + errors.height),
         ]
@@ -236,8 +245,6 @@ def _kept(value: float, error: float, limit: float) -> Estimate | None:
     return Estimate(value, error) if math.isfinite(value) and error <= limit else None
 
 
-LATE: Final = 0.5
-"""Seconds by which a frame may come after a later one: what is followed goes on, and the frame adds nothing to it."""
 _SEEN: Final = [0, 2, 4]
 """Where offset, heading and curvature stand in the state of a `LaneFilter`."""
 
@@ -283,7 +290,7 @@ class LaneFilter:
             return fit.lane
         step = timestamp - self._last
         off = np.zeros(3)
-        if self._state is None or not -LATE <= step <= self.GAP:
+        if self._state is None or not -LATE <= step <= self.GAP + 1e-6:
             self._start(fit)
             self._last = timestamp
         elif step > 0:  # else it is the same moment again, or a late frame
@@ -434,7 +441,7 @@ class LeadFilter:
     """
 
     ACCELERATION: Final = 2.0
-    """Standard deviation of the relative acceleration in m/s^2."""
+    """How much the closing speed wanders in a second, in m/s: an acceleration taken to last about so long."""
     BOX_NOISE: Final = 0.5
     """The part of `BOX_ERROR` that differs from frame to frame, in pixels."""
     GAP: Final = 0.6
@@ -451,7 +458,9 @@ class LeadFilter:
         self._box: NDArray[np.float32] | None = None
         self._last = self._since = 0.0
 
-    def update(self, lead: LeadVehicle | None, boxes: Boxes, timestamp: float, camera: Camera) -> LeadVehicle | None:
+    def update(
+        self, lead: LeadVehicle | None, boxes: Boxes, timestamp: float, camera: Camera, shaken: float = 0.0
+    ) -> LeadVehicle | None:
         """Return the lead with what its history tells.
 
         Args:
@@ -459,14 +468,15 @@ class LeadFilter:
             boxes: The boxes that it indexes.
             timestamp: Seconds.
             camera: The camera.
+            shaken: Metres, of the error of the distance: what this frame adds to it, as the pitch of a bump does.
         """
         if lead is None:
             return None
         box = boxes.xyxy[lead.box]
         pixel = self.BOX_NOISE * camera.size[1] / 640
-        noise = pixel * (lead.distance.value**2 + camera.height**2) / (camera.fy * camera.height)
+        noise = math.hypot(pixel * (lead.distance.value**2 + camera.height**2) / (camera.fy * camera.height), shaken)
         step = timestamp - self._last
-        same = self._state is not None and -LATE <= step <= self.GAP and self._is_same(lead, box)
+        same = self._state is not None and -LATE <= step <= self.GAP + 1e-6 and self._is_same(lead, box)
         late = self._state is not None and -LATE <= step < 0
         if late and not same:
             return lead
@@ -505,9 +515,9 @@ class LeadFilter:
     def _advance(self, step: float, distance: float, noise: float) -> None:
         assert self._state is not None
         move = np.array([[1.0, step], [0.0, 1.0]])
-        push = np.array([step * step / 2, step])
+        pushed = np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])  # by white noise
         state = move @ self._state
-        covariance = move @ self._covariance @ move.T + np.outer(push, push) * self.ACCELERATION**2
+        covariance = move @ self._covariance @ move.T + pushed * self.ACCELERATION**2
         total = covariance[0, 0] + noise**2
         gain = covariance[:, 0] / total
         self._state = state + gain * (distance - state[0])

@@ -10,8 +10,7 @@ import math
 from typing import Literal, TypeAlias
 
 from trilitenet.errors import ConfigError
-from trilitenet.road.ego import LATE
-from trilitenet.road.structures import Event, EventKind, Road
+from trilitenet.road.structures import LATE, Event, EventKind, Road
 
 __all__ = ["EventDetector", "EventThresholds"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,11 @@ from trilitenet.structures import Perception
 
 __all__ = ["RoadMonitor"]
 
+_WIDTH_MEMORY: Final = 0.8
+"""Seconds over which the lane's width is averaged."""
+_WIDENING: Final = 0.05
+"""Metres that a lane's width wanders in a second while it is not seen."""
+
 
 class RoadMonitor:
     """Follows the road through a video; use a new one for each video and each picture.
@@ -32,6 +37,9 @@ class RoadMonitor:
         field_of_view: Assumed horizontal field of view in degrees, without a camera.
         lane_width: Assumed width of a lane in metres, without a camera.
         still: This is a single picture.
+
+    Raises:
+        ConfigError: If the field of view is not between 1 and 179 degrees, or the lane's width not above 0.
     """
 
     def __init__(
@@ -43,6 +51,8 @@ class RoadMonitor:
         lane_width: float = 3.5,
         still: bool = False,
     ) -> None:
+        if camera is None:
+            SelfCalibration((1, 1), field_of_view=field_of_view, lane_width=lane_width)  # tells what is out of range
         self._given = camera
         self._assumed = (field_of_view, lane_width)
         self._still = still
@@ -54,6 +64,7 @@ class RoadMonitor:
         self._calibration: SelfCalibration | None = None
         self._lines: LineTracker | None = None
         self._width: Estimate | None = None
+        self._width_seen = 0.0
         self._clock = 0.0
 
     def __call__(self, perception: Perception) -> Road:
@@ -86,9 +97,10 @@ class RoadMonitor:
         distances = () if perception.boxes is None else find_distances(perception.boxes, camera, errors)
         road = Road(tuple(lines), drivable, camera=camera, calibrated=calibrated, distances=distances)
         usual = CameraErrors() if self._calibration is None else self._calibration.errors
-        fit = fit_ego_lane(*road.ego_lines, camera, errors, usual=usual, known_width=self._width)
+        known = self._known_width(timestamp)
+        fit = fit_ego_lane(*road.ego_lines, camera, errors, usual=usual, known_width=known)
         if fit is not None:
-            road = self._with_lane(road, fit, perception, camera, timestamp)
+            road = self._with_lane(road, fit, perception, timestamp, usual)
         return self._with_events(road, perception, timestamp)
 
     def _prepare(self, size: tuple[int, int]) -> None:
@@ -130,20 +142,39 @@ class RoadMonitor:
                 errors = dataclasses.replace(errors, pitch=max(errors.pitch, away / camera.fy))
         return camera, errors, "file" if self._camera is not None else "lanes"
 
-    def _with_lane(self, road: Road, fit: LaneFit, perception: Perception, camera: Camera, timestamp: float) -> Road:
-        width = fit.lane.width
-        if width is not None:
-            past = self._width
-            mean = width.value if past is None else 0.95 * past.value + 0.05 * width.value
-            self._width = Estimate(mean, max(0.1, width.error))
+    def _known_width(self, timestamp: float) -> Estimate | None:
+        """Return the lane's width as it was last seen, the less sure the longer ago that is."""
+        if self._width is None:
+            return None
+        age = abs(timestamp - self._width_seen)
+        return Estimate(self._width.value, math.hypot(self._width.error, _WIDENING * math.sqrt(age)))
+
+    def _see_width(self, width: Estimate, timestamp: float) -> None:
+        step = timestamp - self._width_seen
+        if self._width is None or step > LaneFilter.GAP:
+            mean = width.value
+        else:
+            mean = self._width.value + (width.value - self._width.value) * -math.expm1(-max(step, 0.0) / _WIDTH_MEMORY)
+        self._width = Estimate(mean, max(0.1, width.error, abs(mean - width.value)))
+        self._width_seen = timestamp
+
+    def _with_lane(
+        self, road: Road, fit: LaneFit, perception: Perception, timestamp: float, usual: CameraErrors
+    ) -> Road:
+        camera = road.camera
+        assert camera is not None
+        if fit.lane.width is not None:
+            self._see_width(fit.lane.width, timestamp)
         lead = None
         if perception.boxes is not None:
             lead = find_lead(perception.boxes, road.distances, fit, camera)
-            if not self._still:
-                lead = self._lead.update(lead, perception.boxes, timestamp, camera)
+            if lead is not None and not self._still:
+                calm = find_distances(perception.boxes, camera, usual)[lead.box]
+                shaken = 0.0 if calm is None else math.sqrt(max(lead.distance.error**2 - calm.error**2, 0.0))
+                lead = self._lead.update(lead, perception.boxes, timestamp, camera, shaken)
         lane = fit.lane if self._still else self._lane.update(fit, timestamp)
         if lane.width is None and lane.offset is not None:
-            lane = dataclasses.replace(lane, width=self._width)
+            lane = dataclasses.replace(lane, width=self._known_width(timestamp))
         return dataclasses.replace(road, ego_lane=lane, lead=lead)
 
     def _with_events(self, road: Road, perception: Perception, timestamp: float) -> Road:

@@ -8,14 +8,17 @@ to the left. Every measured quantity comes with one standard deviation of its er
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.processing.geometry import Camera
 
-__all__ = ["EgoLane", "Estimate", "Event", "EventKind", "GroundCurve", "LaneLine", "LeadVehicle", "Road"]
+__all__ = ["LATE", "EgoLane", "Estimate", "Event", "EventKind", "GroundCurve", "LaneLine", "LeadVehicle", "Road"]
+
+LATE: Final = 0.5
+"""Seconds by which a frame may come after a later one: what is followed goes on, and the frame adds nothing to it."""
 
 EventKind = Literal["lane_departure_left", "lane_departure_right", "forward_collision"]
 

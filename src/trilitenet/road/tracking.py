@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.errors import ConfigError, import_extra
-from trilitenet.road.structures import LaneLine
+from trilitenet.road.structures import LATE, LaneLine
 from trilitenet.structures import Boxes, Perception
 
 __all__ = ["LineTracker", "MaskSmoother", "Steady", "VehicleTracker", "flicker"]
@@ -51,14 +51,16 @@ class VehicleTracker:
 
         Args:
             boxes: Boxes of one frame.
-            timestamp: Seconds. Where they fall, or leap by more than ``memory``, all tracks end; no identity is given
-                twice.
+            timestamp: Seconds. Where they fall by more than `LATE`, or leap by more than ``memory``, all tracks end; no
+                identity is given twice. The boxes of a frame that is late by less have no identity.
 
         Raises:
             ConfigError: If the time stamp is negative or not finite.
         """
         if not 0.0 <= timestamp < math.inf:
             raise ConfigError(f"a time stamp must be at least 0 seconds, got {timestamp}")
+        if self._last is not None and -LATE <= timestamp - self._last < 0:
+            return dataclasses.replace(boxes, track_id=np.full(len(boxes), -1, np.int64))
         if self._last is not None and not 0 <= timestamp - self._last <= self._memory + 1e-6:
             self._tracker, self._numbers = self._new(), {}
         self._last = timestamp
