@@ -231,8 +231,11 @@ def test_what_is_assumed_of_the_camera_reaches_the_monitor_or_is_refused(monkeyp
     assert monitor is not None
     assert monitor._assumed == (60.0, 3.5)
     for options, told in (
-        (RoadOptions(field_of_view=100.0), "--field-of-view would change nothing: it is for --road"),
-        (RoadOptions(camera="c.yaml", lane_width=3.0), "--lane-width would change nothing: the camera file says it"),
+        (RoadOptions(field_of_view=100.0), "--field-of-view would change nothing: that is for --road"),
+        (
+            RoadOptions(camera="c.yaml", lane_width=3.0),
+            "--lane-width would change nothing: with --camera nothing is assumed",
+        ),
         (RoadOptions(measure=True, field_of_view=180.0), "between 1 and 179 degrees, got 180"),
         (RoadOptions(measure=True, lane_width=0.0), "lane width must be above 0 metres"),
     ):

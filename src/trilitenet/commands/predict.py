@@ -92,8 +92,8 @@ class RoadOptions:
         }
         if assumed and (self.camera is not None or not self.measure):
             names = " and ".join(f"--{name.replace('_', '-')}" for name in assumed)
-            why = "the camera file says it" if self.camera is not None else "it is for --road"
-            raise ConfigError(f"{names} would change nothing: {why}; leave it out")
+            why = "with --camera nothing is assumed" if self.camera is not None else "that is for --road"
+            raise ConfigError(f"{names} would change nothing: {why}")
         steady = None
         if not still and (self.track or self.smoothing):
             steady = Steady(track=self.track, smoothing=self.smoothing)
@@ -232,7 +232,7 @@ def predict(
         track: Give vehicles an identity over the frames of a video.
         smoothing: Weight of the past in a video's masks, from 0 (none) to below 1.
         field_of_view: For --road without a camera file: the lens's horizontal field of view in degrees; 60 if left out.
-            Many dash-cams have 100 to 140, of which their pictures' edges are bent.
+            Many dash-cams have 100 to 140; that lenses bend the edges of pictures takes a camera file.
         lane_width: For --road without a camera file: metres between the lines of a lane; 3.5 if left out.
 
     Returns:

@@ -27,8 +27,9 @@ from trilitenet.processing.images import read_image
 __all__ = ["Header", "MemoryBudget", "Reservation", "check_header", "decode", "read_header"]
 
 _MAX_SEGMENTS: Final = 1_000
-_FILL: Final = re.compile(rb"\xff+")
 """Segments of a JPEG, of which its header, metadata and scans are made; each costs 10 microseconds."""
+_FILL: Final = re.compile(rb"\xff+")
+"""Bytes that may stand before a marker, any number of them."""
 
 Kind = Literal["JPEG", "PNG", "WEBP"]
 
