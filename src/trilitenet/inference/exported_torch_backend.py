@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.export.passes import move_to_device_pass
 
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY
 from trilitenet.errors import ShapeError, WeightsError
@@ -57,6 +56,8 @@ class ExportedTorchBackend(ArtefactBackend):
         self.device = pick_device("cpu" if device == "auto" else device)
         self._path = path
         if self.device.type != "cpu":  # the program makes tensors of its own, and checks where its inputs are
+            from torch.export.passes import move_to_device_pass  # which few need
+
             program = move_to_device_pass(program, str(torch.empty(0, device=self.device).device))  # with its number
         self._module: torch.nn.Module | None = program.module()
 
