@@ -198,12 +198,12 @@ def test_with_tracks_the_lead_keeps_its_number(drive: tuple[Scene, ...], perceiv
     assert len(set(tracks[4:])) == 1
 
 
-def marked(camera: Camera, *sides: float) -> Perception:
-    """Draw straight lines so many metres to the left."""
+def marked(camera: Camera, *sides: float, curvature: float = 0.0) -> Perception:
+    """Draw lines so many metres to the left, straight or bending to it."""
     ahead = np.linspace(4.5, 60.0, 200)
     mask = np.zeros(camera.size, np.uint8)
     for side in sides:
-        pixels = camera.to_pixels(np.stack([ahead, np.full_like(ahead, side)], axis=1))
+        pixels = camera.to_pixels(np.stack([ahead, side + curvature * ahead**2 / 2], axis=1))
         cv2.polylines(mask, [np.round(pixels).astype(np.int32)], False, 1, 3)
     return Perception(camera.size, lane=mask > 0)
 
@@ -222,6 +222,23 @@ def test_with_one_line_in_sight_the_lane_has_the_width_from_before() -> None:
     assert lane is not None
     assert lane.offset is not None
     assert lane.offset.value == pytest.approx(0.3, abs=0.1)
+
+
+@pytest.mark.parametrize("radius", [300, -500])
+def test_a_bend_that_is_calibrated_as_yaw_is_in_the_errors(radius: int) -> None:
+    camera = Camera.from_field_of_view((720, 1280), 60.0, 1.4, pitch=0.03)
+    monitor = RoadMonitor()
+    for _ in range(60):
+        lane = monitor(marked(camera, 1.75, -1.75, curvature=1 / radius)).ego_lane
+    assert lane is not None
+    assert lane.heading is not None
+    assert 0.008 < abs(lane.heading.value) < 2 * lane.heading.error  # the vehicle drives along the lane
+    straight = RoadMonitor()
+    for _ in range(60):
+        lane = straight(marked(camera, 1.75, -1.75)).ego_lane
+    assert lane is not None
+    assert lane.heading is not None
+    assert abs(lane.heading.value) < 2 * lane.heading.error < 0.03
 
 
 @pytest.mark.parametrize("rate", [1, 5, 25])

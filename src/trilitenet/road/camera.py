@@ -163,8 +163,8 @@ class SelfCalibration:
 
     The focal length cannot be seen from lanes: it follows from the assumed field of view, and its uncertainty goes into
     every distance. Offsets across the lane do not depend on it. Roll is taken to be 0, and lines to be straight: what a
-    camera is tilted to the side by goes into offsets, for which their error has a share; a clip all of a bend is
-    calibrated with a part of it as yaw.
+    camera is tilted to the side by goes into offsets, and what a clip bends by for the most part into yaw; the errors
+    have shares for both.
 
     Args:
         size: (height, width) of the pictures in pixels.
@@ -183,6 +183,9 @@ class SelfCalibration:
     """Standard deviation of the assumed lane width, as a share."""
     ROLL_ERROR: Final = 0.02
     """Standard deviation of the roll, which is taken to be 0, in radians."""
+    BEND_REACH: Final = 5.7
+    """Radians of yaw for each 1/m of a bend: lines that bend vanish aside of where the camera looks, by half the metres
+    to the middle of what is seen of them."""
 
     def __init__(
         self, size: tuple[int, int], *, field_of_view: float = 60.0, lane_width: float = 3.5, still: bool = False
@@ -193,6 +196,7 @@ class SelfCalibration:
         self._level = Camera.from_field_of_view(size, field_of_view, 1.0)
         self._points: deque[tuple[float, float, float]] = deque(maxlen=self.WINDOW)
         self._spreads: deque[float] = deque(maxlen=self.WINDOW)
+        self._bends: deque[float] = deque(maxlen=self.WINDOW)
         self.camera: Camera | None = None
         self.errors = CameraErrors()
 
@@ -211,6 +215,10 @@ class SelfCalibration:
                 # The width of a lane in pixels grows in proportion to the distance below the horizon.
                 self._spreads.append(float(right.column(low) - left.column(low)) / (low - found.v))
         self._solve()
+
+    def see_bend(self, curvature: float) -> None:
+        """Take in the curvature of one frame's lane in 1/m: what most frames bend by may be in the yaw."""
+        self._bends.append(curvature)
 
     def _solve(self) -> None:
         points = np.array(self._points)
@@ -237,6 +245,7 @@ class SelfCalibration:
             return
         self.camera = dataclasses.replace(self._level, height=mounted, pitch=pitch, yaw=yaw)
         yaw_error = float(scatter[0]) / focal + (0.02 if self.still else 0.003)
+        yaw_error += self.BEND_REACH * abs(float(np.median(self._bends))) if self._bends else 0.0
         self.errors = CameraErrors(pitch_error, yaw_error, self.WIDTH_ERROR, self.FOCAL_ERROR, self.ROLL_ERROR)
 
 

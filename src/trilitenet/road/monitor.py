@@ -100,6 +100,8 @@ class RoadMonitor:
         known = self._known_width(timestamp)
         fit = fit_ego_lane(*road.ego_lines, camera, errors, usual=usual, known_width=known)
         if fit is not None:
+            if self._calibration is not None and fit.lane.curvature is not None:
+                self._calibration.see_bend(fit.lane.curvature.value)
             road = self._with_lane(road, fit, perception, timestamp, usual)
         return self._with_events(road, perception, timestamp)
 
