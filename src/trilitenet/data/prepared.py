@@ -346,10 +346,7 @@ class PreparedDataset:
     def fingerprint(self, index: int) -> str:
         """Return a hash of what the shard's index says of a sample: boxes, attributes, and the hash of its parts."""
         entry = self._entry(index)
-        for of_the_shard in (
-            "made_from",
-            "shard",
-        ):  # when its files were written, which a copy of them is not; its hash
+        for of_the_shard in ("made_from", "shard"):  # its hash, and when what it is made from was written
             entry.pop(of_the_shard, None)
         return hashlib.sha256(json.dumps(entry).encode()).hexdigest()[:16]
 
