@@ -66,29 +66,34 @@ def test_a_pool_works_and_tells_errors() -> None:
             pool.submit(int, "x").result()
 
 
+def run_script(path: Path, text: str) -> tuple[str, str]:
+    """Return what a script prints, and what it complains of."""
+    path.write_text(text)
+    done = subprocess.run([sys.executable, path], capture_output=True, text=True, check=True, timeout=60)
+    return done.stdout, done.stderr
+
+
 def test_a_plain_script_needs_no_guard(tmp_path: Path) -> None:
-    script = tmp_path / "plain.py"
-    script.write_text(
+    said = run_script(
+        tmp_path / "plain.py",
         "from trilitenet.processing.cores import ProcessPool\n"
         "print('once')\n"
         "with ProcessPool(2) as pool:\n"
-        "    print(list(pool.map(abs, [-1, 2])), __file__ == __import__('sys').argv[0], __spec__)\n"
+        "    print(list(pool.map(abs, [-1, 2])), __file__ == __import__('sys').argv[0], __spec__)\n",
     )
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True, timeout=60)
-    assert (done.stdout, done.stderr) == ("once\n[1, 2] True None\n", "")
+    assert said == ("once\n[1, 2] True None\n", "")
 
 
 def test_a_guarded_script_may_hand_over_what_is_its_own(tmp_path: Path) -> None:
-    script = tmp_path / "guarded.py"
-    script.write_text(
+    said = run_script(
+        tmp_path / "guarded.py",
         "from trilitenet.processing.cores import ProcessPool\n"
         "def twice(number): return 2 * number\n"
         "if __name__ == '__main__':\n"
         "    with ProcessPool(2) as pool:\n"
-        "        print(list(pool.map(twice, [1, 2])))\n"
+        "        print(list(pool.map(twice, [1, 2])))\n",
     )
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True, timeout=60)
-    assert (done.stdout, done.stderr) == ("[2, 4]\n", "")
+    assert said == ("[2, 4]\n", "")
 
 
 def test_a_process_that_is_killed_is_one_line() -> None:

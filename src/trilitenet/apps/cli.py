@@ -172,6 +172,8 @@ _LISTS: Final = {
     "--where": r"[\w.-]+=.+",
 }
 """Options that take several values, and what a value looks like, so that no file or model is taken for one."""
+_ANY_WORD: Final = {"--by": "", "--classes": "", "--splits": _SPLIT}
+"""Those of which any word may be a value, unless there is a file of that name; and the words that are one even then."""
 
 
 def _repeated(words: Sequence[str]) -> list[str]:
@@ -180,8 +182,8 @@ def _repeated(words: Sequence[str]) -> list[str]:
     option = ""
     for word in words:
         further = bool(option) and re.fullmatch(_LISTS[option], word) is not None
-        if option in {"--by", "--classes", "--splits"} and os.access(word, os.F_OK):  # any word may be one of these
-            further = further and option == "--splits" and re.fullmatch(_SPLIT, word) is not None
+        if option in _ANY_WORD and os.access(word, os.F_OK) and re.fullmatch(_ANY_WORD[option], word) is None:
+            further = False
         if further and spread[-1] != option:
             spread.append(option)
         elif not further:

@@ -245,6 +245,11 @@ def _kept(value: float, error: float, limit: float) -> Estimate | None:
     return Estimate(value, error) if math.isfinite(value) and error <= limit else None
 
 
+def _pushed(step: float) -> Floats:
+    """Return the covariance of a value and its rate after so many seconds in which white noise of 1 pushes the rate."""
+    return np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
+
+
 _SEEN: Final = [0, 2, 4]
 """Where offset, heading and curvature stand in the state of a `LaneFilter`."""
 
@@ -320,7 +325,7 @@ class LaneFilter:
         move = np.eye(5)
         move[0, 1] = move[2, 3] = step
         noise = np.zeros((5, 5))
-        pushed = np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])  # by white noise
+        pushed = _pushed(step)
         noise[:2, :2] = pushed * self.SWERVE**2
         noise[2:4, 2:4] = pushed * self.TURN**2
         noise[4, 4] = self.BEND**2 * step
@@ -515,9 +520,8 @@ class LeadFilter:
     def _advance(self, step: float, distance: float, noise: float) -> None:
         assert self._state is not None
         move = np.array([[1.0, step], [0.0, 1.0]])
-        pushed = np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])  # by white noise
         state = move @ self._state
-        covariance = move @ self._covariance @ move.T + pushed * self.ACCELERATION**2
+        covariance = move @ self._covariance @ move.T + _pushed(step) * self.ACCELERATION**2
         total = covariance[0, 0] + noise**2
         gain = covariance[:, 0] / total
         self._state = state + gain * (distance - state[0])

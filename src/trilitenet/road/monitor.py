@@ -102,7 +102,7 @@ class RoadMonitor:
         if fit is not None:
             if self._calibration is not None and fit.lane.curvature is not None:
                 self._calibration.see_bend(fit.lane.curvature.value)
-            road = self._with_lane(road, fit, perception, timestamp, usual)
+            road = self._with_lane(road, fit, perception, timestamp, None if errors == usual else usual)
         return self._with_events(road, perception, timestamp)
 
     def _prepare(self, size: tuple[int, int]) -> None:
@@ -161,8 +161,9 @@ class RoadMonitor:
         self._width_seen = timestamp
 
     def _with_lane(
-        self, road: Road, fit: LaneFit, perception: Perception, timestamp: float, usual: CameraErrors
+        self, road: Road, fit: LaneFit, perception: Perception, timestamp: float, usual: CameraErrors | None
     ) -> Road:
+        """Add the lane and the lead; ``usual`` is how well the camera is known where this frame's errors are others."""
         camera = road.camera
         assert camera is not None
         if fit.lane.width is not None:
@@ -171,7 +172,7 @@ class RoadMonitor:
         if perception.boxes is not None:
             lead = find_lead(perception.boxes, road.distances, fit, camera)
             if lead is not None and not self._still:
-                calm = find_distances(perception.boxes, camera, usual)[lead.box]
+                calm = None if usual is None else find_distances(perception.boxes, camera, usual)[lead.box]
                 shaken = 0.0 if calm is None else math.sqrt(max(lead.distance.error**2 - calm.error**2, 0.0))
                 lead = self._lead.update(lead, perception.boxes, timestamp, camera, shaken)
         lane = fit.lane if self._still else self._lane.update(fit, timestamp)

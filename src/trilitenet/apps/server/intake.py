@@ -124,8 +124,7 @@ def _jpeg(data: bytes) -> Header:
     for _ in range(_MAX_SEGMENTS):
         if data[position] != 0xFF:
             raise ProblemError(422, "broken_image", "the JPEG image has a broken header")
-        fill = _FILL.match(data, position)
-        position = position + 1 if fill is None else fill.end()
+        position = _FILL.match(data, position).end()  # type: ignore[union-attr]  # one is there
         marker = data[position]
         position += 1
         if marker in {0xD8, 0x01} or 0xD0 <= marker <= 0xD7:

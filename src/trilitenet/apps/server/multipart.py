@@ -15,8 +15,8 @@ __all__ = ["Part", "split_form"]
 
 _MAX_HEADERS: Final = 4096
 """Bytes of the headers of one part."""
-_MAX_HEADER: Final = 1024
-"""Characters of a header with parameters, which take quadratic time to read."""
+_LONGEST_VALUE: Final = 1024
+"""Characters of a header's value with parameters, which take quadratic time to read."""
 
 
 class Part(NamedTuple):
@@ -75,9 +75,9 @@ def _field_name(headers: bytes) -> str:
 
 
 def _parameter(header: str, value: str, name: str) -> str:
-    if len(value) > _MAX_HEADER:
+    if len(value) > _LONGEST_VALUE:
         raise ProblemError(
-            400, "bad_form", f"a {header} of the multipart form is longer than {_MAX_HEADER:,} characters"
+            400, "bad_form", f"a {header} of the multipart form is longer than {_LONGEST_VALUE:,} characters"
         )
     message = Message()
     message[header] = value.replace("\r", " ").replace("\n", " ").strip()

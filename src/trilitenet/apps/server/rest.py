@@ -22,7 +22,7 @@ from trilitenet.apps.server import openapi
 from trilitenet.apps.server.intake import Reservation, check_header, read_body, read_header
 from trilitenet.apps.server.multipart import split_form
 from trilitenet.apps.server.problems import BusyError, ProblemError
-from trilitenet.apps.server.service import Encoded, Outcome, Service
+from trilitenet.apps.server.service import Encoded, Outcome, Service, together
 from trilitenet.errors import did_you_mean
 from trilitenet.processing.drawing import DRIVABLE_COLOUR, LANE_COLOUR
 from trilitenet.structures import Perception
@@ -77,12 +77,7 @@ def rest_router(service: Service) -> APIRouter:
                         service.admission.skip()
                     return _refusal(problem)
 
-            tasks = [asyncio.ensure_future(settle(image)) for image in images]
-            try:
-                results = await until_vanished(request, asyncio.gather(*tasks))
-            finally:
-                for task in tasks:  # the first that fails otherwise than by a problem of its own ends them all
-                    task.cancel()
+            results = await until_vanished(request, together(map(settle, images)))
         if all(result["status"] == 503 for result in results):
             raise BusyError(**{name: results[0]["error"][name] for name in ("code", "message")})
         for result in results:
@@ -148,7 +143,7 @@ async def read_request(request: Request, service: Service, reservation: Reservat
         raise ProblemError(499, "vanished", "the client went away") from None
 
 
-async def until_vanished(request: Request, work: Coroutine[Any, Any, _T] | asyncio.Future[_T]) -> _T:
+async def until_vanished(request: Request, work: Coroutine[Any, Any, _T]) -> _T:
     """Await work, and cancel it as soon as the client goes away.
 
     Raises:

@@ -12,7 +12,7 @@ import functools
 import io
 import math
 import time
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, Final, TypeVar
@@ -31,7 +31,7 @@ from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.structures import Perception, RawOutputs
 
-__all__ = ["Encoded", "Outcome", "Service", "in_time"]
+__all__ = ["Encoded", "Outcome", "Service", "in_time", "together"]
 
 _T = TypeVar("_T")
 
@@ -206,12 +206,7 @@ class Service:
         finish: Callable[[Outcome], _T],
     ) -> list[_T]:
         """Take several admitted images through all stages; the first failure ends them all."""
-        tasks = [asyncio.ensure_future(self.see(image, deadline, finish)) for image in images]
-        try:
-            return list(await asyncio.gather(*tasks))
-        finally:
-            for task in tasks:
-                task.cancel()
+        return await together(self.see(image, deadline, finish) for image in images)
 
     async def _stages(
         self,
@@ -268,6 +263,16 @@ class Service:
     def _observe_batch(self, size: int) -> None:
         self.metrics.batch(size)
         self.admission.observe(size)
+
+
+async def together(works: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
+    """Await several works at once; the first failure ends them all, and so does it when this is cancelled."""
+    tasks = [asyncio.ensure_future(work) for work in works]
+    try:
+        return list(await asyncio.gather(*tasks))
+    finally:
+        for task in tasks:
+            task.cancel()
 
 
 async def in_time(work: Awaitable[_T], deadline: float) -> _T:
