@@ -259,6 +259,26 @@ def test_predictions_of_other_images_are_refused_at_once(
         score(tmp_path, data=data, limit=limit)
 
 
+def test_boxes_of_names_that_the_split_lacks_are_told(
+    run: tuple[Report, Path], data: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    saved = tmp_path / "saved"
+    saved.mkdir()
+    names = DrivingDataset(data, "val").names
+    entry = {"category_id": 1, "bbox": [0, 0, 2, 2], "score": 0.5}
+    entries = [entry | {"image_id": name} for name in (names[0], f"{names[1]}.jpg")]
+    (saved / "detections.json").write_text(json.dumps(entries))
+    score(saved, data=data, resamples=0, worst=0)
+    assert (
+        f"boxes of 1 images are left out, for the split has none of that name (such as '{names[1]}.jpg')" in caplog.text
+    )
+    assert f"no box for {len(names) - 1} of {len(names)} images, which count as seen empty" in caplog.text
+    caplog.clear()
+    (saved / "detections.json").write_text(json.dumps([entry | {"image_id": name} for name in names]))
+    score(saved, data=data, resamples=0, worst=0)
+    assert caplog.text == ""
+
+
 def test_data_of_other_classes_are_told(
     artefacts: Artefacts, data: Path, weights: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

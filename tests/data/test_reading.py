@@ -344,6 +344,12 @@ def test_an_image_of_an_absurd_size_is_a_broken_one() -> None:
         decode_mask(data, "huge.png", MaskMeaning())
 
 
+def test_a_mask_of_16_bits_is_refused_not_read_as_empty() -> None:
+    deep = cv2.imencode(".png", np.full((4, 4), 255, np.uint16))[1].tobytes()
+    with pytest.raises(DataError, match="has 16 bits a pixel; save it with 8"):
+        decode_mask(deep, "a.png", MaskMeaning())
+
+
 def test_another_ego_mask_makes_another_sample(root: Path) -> None:
     before = DrivingDataset(root, "train").fingerprint(0)
     seen = {before}

@@ -119,6 +119,7 @@ def test_a_part_that_is_not_there_is_a_task_that_is_not_scored(tmp_path: Path) -
         ('[{"image_id": "a", "category_id": 0, "bbox": [0, 0, 1, 1], "score": 0.5}]', "category_id 0 is not 1 to 2"),
         ('[{"image_id": "a", "category_id": 3, "bbox": [0, 0, 1, 1], "score": 0.5}]', "category_id 3 is not 1 to 2"),
         ("[{", "not COCO results"),
+        ('[{"image_id": "a", "category_id": 1, "bbox": [9, 9, -5, 5], "score": 0.5}]', "left, top, width, height"),
         (f"[{BOX} {BOX}]", "not one JSON list, at character"),
         (f"[{BOX}] {BOX}", "not one JSON list, at character"),
         (f"[{BOX}", "not one JSON list, at character"),
@@ -167,6 +168,9 @@ def test_masks_must_be_there_and_fit(tmp_path: Path) -> None:
         saved.get("a", (4, 4))
     cv2.imwrite(str(tmp_path / "lane" / "a.png"), np.zeros((4, 5), np.uint8))
     with pytest.raises(DataError, match="5x4, the image is 4x4"):
+        saved.get("a", (4, 4))
+    cv2.imwrite(str(tmp_path / "lane" / "a.png"), np.full((4, 4), 255, np.uint16))  # OpenCV would make it 0
+    with pytest.raises(DataError, match="has 16 bits a pixel; save it with 8"):
         saved.get("a", (4, 4))
 
 

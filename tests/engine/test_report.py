@@ -232,6 +232,36 @@ def test_reports_of_other_images_or_labels_are_not_paired(report: Report) -> Non
         compare_reports({})
 
 
+def test_differences_are_drawn_by_the_groups_of_the_images(report: Report, tmp_path: Path) -> None:
+    images = Images(40)
+    better = evaluate(fake_predictor(images), images, protocol="both", resamples=0)
+    grouped = dataclasses.replace(report, groups=tuple(index // 8 for index in range(40)), group="sequence")
+    key = "fair/drivable/iou"
+    plain = compare_reports({"a": report, "b": better}, resamples=100)
+    whole = compare_reports({"a": grouped, "b": better}, resamples=100)
+    one, other = plain.difference("b", key), whole.difference("b", key)
+    assert one is not None
+    assert other is not None
+    assert one.value == other.value
+    assert (one.low, one.high) != (other.low, other.high)
+    assert whole.drawn == "5 groups of images (by sequence)"
+    assert whole.drawn in " ".join(whole.summary().split())
+    grouped.save_json(tmp_path / "report.json")
+    again = read_report(tmp_path / "report.json")
+    assert (again.groups, again.group, again.drawn) == (grouped.groups, "sequence", grouped.drawn)
+    alone = compare_reports({"a": dataclasses.replace(report, groups=(0,) * 40), "b": better}, resamples=20)
+    assert not alone.differences
+    assert "1 group of images" in alone.unpaired["b"]
+
+
+@pytest.mark.parametrize("groups", [[0, 1], [-1] * 40, ["a"] * 40])
+def test_groups_that_are_none_are_refused(report: Report, tmp_path: Path, groups: list[object]) -> None:
+    path = tmp_path / "report.json"
+    path.write_text(json.dumps(report.to_dict() | {"groups": groups}))
+    with pytest.raises(DataError, match="not a report"):
+        read_report(path)
+
+
 def test_published_rows_stand_beside_with_their_protocol(report: Report, tmp_path: Path) -> None:
     comparison = compare_reports({"mine": report}, published=True, resamples=10)
     text = comparison.summary()

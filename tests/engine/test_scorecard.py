@@ -14,7 +14,7 @@ from trilitenet.structures import Boxes, Perception
 SIZE = (64, 64)
 
 
-def card(**settings: int) -> Scorecard:
+def card(**settings: int | str) -> Scorecard:
     return Scorecard(("vehicle",), ("detection",), **settings)  # type: ignore[arg-type]
 
 
@@ -73,6 +73,55 @@ def test_images_without_an_attribute_that_others_have_are_a_row() -> None:
         add(scores, name, 1, 0, **attributes)
     rows = [(row.value, row.images) for row in scores.report(nothing, resamples=0).conditions]
     assert rows == [("undefined", 2), ("clear", 1), ("rain", 1)]
+
+
+def test_images_that_share_a_sequence_are_drawn_together() -> None:
+    scores, apart = card(), card(group="image")
+    for index, sequence in enumerate(("drive", "drive", "", "other", "drive", "")):
+        for to in (scores, apart):
+            add(to, str(index), 1 + index, index, sequence=sequence)
+    report = scores.report(nothing, resamples=20)
+    assert (report.groups, report.group) == ((0, 0, 1, 2, 0, 3), "sequence")
+    assert report.drawn == "4 groups of images (by sequence)"
+    alone = apart.report(nothing, resamples=20)
+    assert (alone.groups, alone.drawn) == ((), "6 images")
+    key = "fair/detection/precision"
+    assert report.figures[key].value == alone.figures[key].value
+
+
+def test_a_single_group_gives_no_interval() -> None:
+    scores = card()
+    for index in range(5):
+        add(scores, str(index), 1, index, sequence="drive")
+    report = scores.report(nothing, resamples=20)
+    assert report.figures["fair/detection/recall"].spread == ""
+    assert "--group image" in report.summary()
+
+
+def test_an_attribute_to_draw_by_that_no_image_has_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    scores = card(group="sorce")
+    add(scores, "a", 1, 0, source="x")
+    scores.report(nothing, resamples=0)
+    assert "no image has the attribute 'sorce' to draw by; did you mean 'source'" in caplog.text
+
+
+def test_few_is_told_by_the_labels_of_the_task() -> None:
+    scores = Scorecard(("vehicle",), ("detection", "lane"), worst=0)
+    lane = np.ones(SIZE, np.uint8)
+    for index in range(40):
+        truth = lane if index < 2 else None
+        sample = Sample(
+            str(index), np.zeros((*SIZE, 3), np.uint8), boxes(1), np.zeros(1, np.int64), lane=truth,
+            attributes={"timeofday": "daytime"},
+        )  # fmt: skip
+        scores.add(sample, Perception(SIZE, boxes=Boxes.empty(), lane=lane.astype(np.bool_)), None)
+    report = scores.report(nothing, resamples=0)
+    (row,) = report.conditions
+    assert row.labelled == {"detection": 40, "lane": 2}
+    assert not row.few
+    assert row.few_for("fair/lane/iou")
+    assert not row.few_for("fair/detection/ap50")
+    assert "(100.0)" in report.summary()
 
 
 def test_plots_of_detection_have_few_points_and_all_boxes() -> None:

@@ -50,3 +50,31 @@ def test_an_error_in_a_thread_is_raised() -> None:
 
     with pytest.raises(ValueError, match="broken"):
         bootstrap(fail, 5, 500)
+
+
+def test_groups_are_drawn_as_wholes() -> None:
+    weights = np.concatenate(list(draws(6, 130, seed=2, groups=(0, 0, 0, 1, 2, 2))))
+    assert (weights[:, 1:3] == weights[:, :1]).all()
+    assert (weights[:, 4] == weights[:, 5]).all()
+    assert (weights[:, [0, 3, 4]].sum(axis=1) == 3).all()
+    apart = np.concatenate(list(draws(6, 130, seed=2, groups=range(6))))
+    np.testing.assert_array_equal(apart, np.concatenate(list(draws(6, 130, seed=2))))
+
+
+def test_the_interval_of_like_images_in_groups_is_that_of_the_groups(rng: np.random.Generator) -> None:
+    means = rng.normal(0.5, 0.1, 40)
+    values, groups = np.repeat(means, 10), [index // 10 for index in range(400)]
+
+    def mean(weights: np.ndarray) -> dict[str, np.ndarray]:
+        return {"mean": weights @ values / weights.sum(axis=1)}
+
+    low, high = interval(bootstrap(mean, 400, 2000, groups=groups)["mean"])
+    assert high - low == pytest.approx(2 * 1.96 * means.std(ddof=1) / np.sqrt(40), rel=0.1)
+    close, by = interval(bootstrap(mean, 400, 2000)["mean"])
+    assert by - close == pytest.approx((high - low) / np.sqrt(10), rel=0.1)
+
+
+@pytest.mark.parametrize("groups", [None, (0,)])
+def test_a_single_image_gives_no_interval(groups: tuple[int, ...] | None) -> None:
+    values = bootstrap(lambda weights: {"a": weights.sum(axis=1).astype(float)}, 1, 20, groups=groups)
+    assert np.isnan(interval(values["a"])).all()

@@ -202,6 +202,22 @@ def test_confusion_tells_the_class_taken_for_another() -> None:
     assert metric.confusion.tolist() == [[0, 1, 0], [0, 0, 0], [0, 0, 0]]
 
 
+def test_a_surer_box_of_another_class_does_not_take_an_object_from_the_right_one() -> None:
+    box = np.array([[0, 0, 10, 10]] * 2, np.float32)
+    metric = DetectionMetric(["car", "truck"])
+    outcome = metric.update(box, np.array([0.85, 0.8]), np.array([0, 1]), box[:1], np.array([1]))
+    assert outcome == (1, 1, 0)
+    assert metric.confusion.tolist() == [[0, 0, 0], [0, 1, 0], [1, 0, 0]]
+    assert (metric.compute().at.precision, metric.compute().at.recall) == (0.5, 1.0)
+
+
+def test_right_boxes_of_the_confusion_are_those_of_the_recall(rng: np.random.Generator) -> None:
+    metric = fill(DetectionMetric(["a", "b", "c"], confidence=0.3), random_images(rng, 40, 3))
+    recall = metric.compute().at.recall
+    right, objects = np.trace(metric.confusion[:3, :3]), metric.confusion[:3].sum()
+    assert recall == pytest.approx(right / objects)
+
+
 def test_the_state_survives_json(rng: np.random.Generator) -> None:
     metric = fill(DetectionMetric(["a", "b"]), random_images(rng, 10, 2))
     again = DetectionMetric.from_state(json.loads(json.dumps(metric.state())))

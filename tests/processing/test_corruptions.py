@@ -50,6 +50,27 @@ def test_known_cases(image: np.ndarray) -> None:
     assert corrupt(image, "fog", 3, draw).std() < image.std()
 
 
+def test_a_streak_is_as_long_and_falls_as_the_published_one() -> None:
+    spot = np.zeros((121, 121, 3), np.uint8)
+    spot[59:62, 59:62] = 255
+    for severity, (radius, sigma) in enumerate(((10, 3), (15, 5), (15, 8), (15, 12), (20, 15)), start=1):
+        blurred = corrupt(spot, "motion_blur", severity, np.random.default_rng(3)).astype(float)[..., 0]
+        taps = np.exp(-0.5 * (np.arange(2 * radius + 1) / sigma) ** 2)
+        wanted = (np.arange(2 * radius + 1) * taps).sum() / taps.sum()
+        middle = [(axis * blurred).sum() / blurred.sum() for axis in np.mgrid[:121, :121] - 60]
+        assert np.hypot(*middle) == pytest.approx(wanted, abs=0.4)
+
+
+@pytest.mark.parametrize("severity", [1, 3, 5])
+def test_glass_leaves_things_where_they_are(severity: int) -> None:
+    square = np.zeros((200, 200, 3), np.uint8)
+    square[80:120, 80:120] = 200
+    rows, columns = np.mgrid[:200, :200]
+    blurred = corrupt(square, "glass_blur", severity, np.random.default_rng(0)).astype(float)[..., 0]
+    for axis in (rows, columns):
+        assert (axis * blurred).sum() / blurred.sum() == pytest.approx(99.5, abs=0.35)
+
+
 def test_unknown_ones_are_refused(image: np.ndarray) -> None:
     with pytest.raises(ConfigError, match="did you mean 'snow'"):
         corrupt(image, "snoww", 1, np.random.default_rng(0))

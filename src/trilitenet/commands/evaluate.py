@@ -21,7 +21,7 @@ from trilitenet.engine.predictions import PredictionWriter
 from trilitenet.engine.provenance import hash_files
 from trilitenet.engine.report import Report, Variation, read_report
 from trilitenet.engine.robustness import corrupted_figures, figures_by_size
-from trilitenet.engine.scorecard import CONDITIONS
+from trilitenet.engine.scorecard import CONDITIONS, GROUP
 from trilitenet.errors import ConfigError, DataError, OutputError
 from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.corruptions import SEVERITIES
@@ -46,6 +46,7 @@ def evaluate(
     resamples: int = 1000,
     worst: int = 24,
     by: Sequence[str] = CONDITIONS,
+    group: str = GROUP,
     paper_batch: int = _PAPER_BATCH,
     batch_size: int = 1,
     network: str | None = None,
@@ -72,8 +73,10 @@ def evaluate(
         overwrite: Replace reports and predictions that are there.
         limit: Measure on the first so many images alone.
         resamples: Bootstrap draws for the 95% intervals; 0 for none.
-        worst: How many of the worst images the page shows, a task.
+        worst: How many of the worst images the page shows, a task; under fair.
         by: Attributes to make tables by.
+        group: Images that share this attribute, such as the frames of one drive, are drawn together for the intervals;
+            "image" draws each by itself.
         paper_batch: Images a batch of the published averages.
         batch_size: At most so many images go through the network at once.
         network: The function that built a weight file's network, where it is one of your own: FILE.py:FUNCTION or
@@ -132,6 +135,7 @@ def evaluate(
             resamples=resamples,
             worst=worst,
             by=by,
+            group=group,
             paper_batch=paper_batch,
             on_prediction=None if writer is None else lambda sample, prediction: writer.write(sample.name, prediction),
             progress=shown,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Sequence, Set
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
 from trilitenet.commands.evaluate import check_counts, check_output, hash_dataset, write_report
 from trilitenet.commands.paths import StrPath, one_for_several, optional_path
@@ -14,10 +15,12 @@ from trilitenet.engine.evaluate import score_predictions
 from trilitenet.engine.predictions import DETECTIONS_FILE, SavedPredictions
 from trilitenet.engine.provenance import hash_files
 from trilitenet.engine.report import Report
-from trilitenet.engine.scorecard import CONDITIONS
+from trilitenet.engine.scorecard import CONDITIONS, GROUP
 from trilitenet.errors import ConfigError, DataError
 
 __all__ = ["score"]
+
+_LOGGER: Final = logging.getLogger(__name__)
 
 
 @one_for_several
@@ -36,6 +39,7 @@ def score(
     resamples: int = 1000,
     worst: int = 24,
     by: Sequence[str] = CONDITIONS,
+    group: str = GROUP,
     paper_batch: int = 16,
 ) -> Report:
     """Measure saved predictions of any model, on the scale of `trilitenet evaluate`.
@@ -51,8 +55,10 @@ def score(
         overwrite: Replace a report that is there.
         limit: Measure on the first so many images alone.
         resamples: Bootstrap draws for the 95% intervals; 0 for none.
-        worst: How many of the worst images the page shows, a task.
+        worst: How many of the worst images the page shows, a task; under fair.
         by: Attributes to make tables by.
+        group: Images that share this attribute, such as the frames of one drive, are drawn together for the intervals;
+            "image" draws each by itself.
         paper_batch: Images a batch of the published averages.
 
     Returns:
@@ -75,6 +81,8 @@ def score(
             f"{predictions}: predictions for none of the {len(dataset)} images "
             f"(such as {min(saved.names)!r}); image_id must be the name of the image without ending"
         )
+    if "detection" in saved.tasks:
+        _warn_of_names(saved.names, dataset.names, limit)
     with show_progress("images") as shown:
         if "detection" in saved.tasks:
             dataset.warn_of_foreign(shown)
@@ -87,6 +95,7 @@ def score(
             resamples=resamples,
             worst=worst,
             by=by,
+            group=group,
             paper_batch=paper_batch,
             progress=shown,
             about={
@@ -106,3 +115,19 @@ def score(
         )
     write_report(report, output)
     return report
+
+
+def _warn_of_names(predicted: Set[str], names: Sequence[str], limit: int | None) -> None:
+    """Warn of boxes for images that the split lacks, and say how many of its images no box is for."""
+    strays = predicted - set(names)
+    if strays:
+        _LOGGER.warning(
+            "%s: boxes of %d images are left out, for the split has none of that name (such as %r); image_id must be "
+            "the name of the image without ending", DETECTIONS_FILE, len(strays), min(strays),
+        )  # fmt: skip
+    measured = names[:limit]
+    empty = len(set(measured) - predicted)
+    if empty:
+        _LOGGER.warning(
+            "%s: no box for %d of %d images, which count as seen empty", DETECTIONS_FILE, empty, len(measured)
+        )

@@ -42,6 +42,7 @@ __all__ = [
     "SampleSource",
     "check_root",
     "decode",
+    "decode_grey",
     "decode_image",
     "decode_mask",
     "is_crowd",
@@ -141,16 +142,28 @@ def decode(buffer: NDArray[np.uint8], mode: int) -> NDArray[Any] | None:
         return None
 
 
+def decode_grey(buffer: NDArray[np.uint8], name: str) -> NDArray[np.uint8] | None:
+    """Decode an encoded image to (H, W) uint8 grey; None if it cannot be read.
+
+    Raises:
+        DataError: If it has more than 8 bits a pixel, which OpenCV would divide, so that 1 to 255 became 0.
+    """
+    grey = decode(buffer, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if grey is not None and grey.dtype != np.uint8:
+        raise DataError(f"{name}: has {8 * grey.dtype.itemsize} bits a pixel; save it with 8")
+    return grey
+
+
 def decode_mask(
     data: bytes | NDArray[np.uint8], name: str, meaning: MaskMeaning
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     """Decode an encoded mask into (H, W) uint8 {0, 1} and, if it has ignored values, where it is valid.
 
     Raises:
-        DataError: If it is not an image, or a broken one.
+        DataError: If it is not an image, a broken one, or one of more than 8 bits a pixel.
     """
     buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes) else data
-    grey = decode(buffer, cv2.IMREAD_GRAYSCALE)
+    grey = decode_grey(buffer, name)
     if grey is None:
         raise DataError(f"{name}: not a mask that can be decoded; run `trilitenet data check` on the data set")
     if not meaning.ignore:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -66,6 +66,7 @@ class Comparison:
         confidence: Name -> the confidence that precision, recall and F1 of boxes are stated at.
         published: Published rows beside them.
         resamples: Bootstrap draws.
+        drawn: What they are drawn from, in words.
     """
 
     names: tuple[str, ...]
@@ -76,6 +77,7 @@ class Comparison:
     confidence: dict[str, float]
     published: tuple[PublishedRow, ...]
     resamples: int
+    drawn: str
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``json.dumps`` takes (NaN is null)."""
@@ -89,6 +91,7 @@ class Comparison:
             "confidence": self.confidence,
             "published": [dataclasses.asdict(row) for row in self.published],
             "resamples": self.resamples,
+            "drawn": self.drawn,
         }
         return dict(without_nan(mapping))
 
@@ -105,9 +108,14 @@ class Comparison:
     def summary(self) -> str:
         """Return the comparison as text for a terminal."""
         parts: list[Table | Text] = [_figure_table(self)]
-        parts.append(
-            Text("* differs from the first: the 95% interval of the paired difference leaves out 0", style="dim")
-        )
+        if self.differences:
+            parts.append(
+                Text(
+                    "* differs from the first: the 95% interval of the paired difference leaves out 0; drawn from "
+                    f"{self.drawn}",
+                    style="dim",
+                )
+            )
         parts += [Text(f"{name}: {reason}") for name, reason in self.unpaired.items()]
         if note := self.confidence_note():
             parts.append(Text(note))
@@ -133,7 +141,8 @@ def compare_reports(
     """Compare reports with the first of them.
 
     Images are resampled once for all models measured on the same images with the same labels, so that what is hard is
-    hard for each of them; the difference of a figure is real when its 95% interval leaves out 0.
+    hard for each of them; the difference of a figure is real when its 95% interval leaves out 0. Where the first report
+    has its images in groups, such as the frames of a drive, whole groups are drawn for all.
 
     Args:
         reports: Name -> report, at least one.
@@ -148,7 +157,8 @@ def compare_reports(
         raise ConfigError("at least one report is needed")
     names = tuple(reports)
     first = reports[names[0]]
-    base = _spread(first, resamples, seed)
+    groups = first.groups or None
+    base = _spread(first, resamples, seed, groups)
     differences: list[Difference] = []
     unpaired: dict[str, str] = {}
     for name in names[1:]:
@@ -161,7 +171,7 @@ def compare_reports(
             )
         if "" in reasons:
             continue
-        spread = _spread(other, resamples, seed)
+        spread = _spread(other, resamples, seed, groups)
         for key, figure in other.figures.items():
             if any(part in key for part in reasons):
                 continue
@@ -182,20 +192,23 @@ def compare_reports(
         },
         published=PUBLISHED_ROWS if published else (),
         resamples=resamples,
+        drawn=first.drawn,
     )
 
 
-def _spread(report: Report, resamples: int, seed: int) -> dict[str, FloatArray]:
+def _spread(report: Report, resamples: int, seed: int, groups: Sequence[int] | None) -> dict[str, FloatArray]:
     """Return figure key -> (resamples,) values; the same seed draws the same images for every report."""
     return {
         f"{protocol}/{name}": values
         for protocol, metrics in report.metrics().items()
-        for name, values in bootstrap(metrics.figures, len(report.names), resamples, seed).items()
+        for name, values in bootstrap(metrics.figures, len(report.names), resamples, seed, groups).items()
     }
 
 
 def _why_unpaired(first: Report, other: Report) -> dict[str, str]:
     """Say why figures of two reports cannot be compared image by image: part of their keys -> the reason."""
+    if len(set(first.groups or first.names)) == 1:
+        return {"": f"drawn from {first.drawn}"}
     if first.names != other.names:
         return {"": f"measured on other images ({len(other.names)}, the first on {len(first.names)})"}
     hashes = [report.provenance.data_sha256 for report in (first, other)]
@@ -278,8 +291,8 @@ def _comparison_page(comparison: Comparison) -> str:
     names = comparison.names
     parts = [
         f"<h1>{escape(' against '.join(names)) if len(names) > 1 else escape(names[0])}</h1>",
-        f'<p class="lead">Differences to {escape(names[0])}, image by image, {comparison.resamples} resamplings. '
-        "Filled: the 95% interval leaves out 0.</p>",
+        f'<p class="lead">Differences to {escape(names[0])}, {comparison.resamples} draws from '
+        f"{escape(comparison.drawn)}. Filled: the 95% interval leaves out 0.</p>",
     ]
     plots = []
     for name in names[1:]:

@@ -28,7 +28,7 @@ from trilitenet.config import ModelCard, Thresholds
 from trilitenet.engine.predictions import SavedPredictions
 from trilitenet.engine.provenance import describe_hardware, describe_versions, peak_memory
 from trilitenet.engine.report import SAVED, Provenance, Report
-from trilitenet.engine.scorecard import CONDITIONS, PAPER_THRESHOLDS, Scorecard
+from trilitenet.engine.scorecard import CONDITIONS, GROUP, PAPER_THRESHOLDS, Scorecard
 from trilitenet.engine.scoring import CanvasPrediction, LabelledImage, add_boxes
 from trilitenet.errors import ConfigError, DataError
 from trilitenet.metrics.detection import DetectionMetric
@@ -115,6 +115,7 @@ def evaluate(
     seed: int = 0,
     worst: int = 24,
     by: Sequence[str] = CONDITIONS,
+    group: str = GROUP,
     paper_batch: int = 16,
     change: ImageChange | None = None,
     on_prediction: Callable[[LabelledImage, Perception], None] | None = None,
@@ -133,6 +134,7 @@ def evaluate(
         seed: Of the draws.
         worst: How many of the worst images to keep pictures of, a task; 0 for none.
         by: Attributes to make tables by.
+        group: Attribute whose images are drawn together for the intervals; ``"image"`` for each by itself.
         paper_batch: Images a batch of the published averages.
         change: Alters each image before the network sees it (corruptions); labels stay.
         on_prediction: Called with every image and its prediction in pixels of the image, in order.
@@ -154,6 +156,7 @@ def evaluate(
         paper_batch=paper_batch,
         worst=worst,
         by=by,
+        group=group,
     )
     started = time.time()
     canvases: dict[tuple[int, int], None] = {}
@@ -189,6 +192,7 @@ def score_predictions(
     seed: int = 0,
     worst: int = 24,
     by: Sequence[str] = CONDITIONS,
+    group: str = GROUP,
     paper_batch: int = 16,
     progress: Callable[[int, int], None] | None = None,
     about: Mapping[str, Any] | None = None,
@@ -208,6 +212,7 @@ def score_predictions(
         seed: Of the draws.
         worst: How many of the worst images to keep pictures of, a task; 0 for none.
         by: Attributes to make tables by.
+        group: Attribute whose images are drawn together for the intervals; ``"image"`` for each by itself.
         paper_batch: Images a batch of the published averages.
         progress: Called with how many images are scored, and of how many.
         about: Fields of `Provenance` that only the caller knows.
@@ -224,6 +229,7 @@ def score_predictions(
         paper_batch=paper_batch,
         worst=worst,
         by=by,
+        group=group,
     )
     started = time.time()
     count = _count(dataset, limit)

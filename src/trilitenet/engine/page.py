@@ -41,14 +41,14 @@ def section(title: str, body: str, note: str = "") -> str:
     return f"<section><h2>{escape(title)}</h2>{below}{body}</section>"
 
 
-def bar_cell(value: float | None, note: str = "") -> str:
-    """Return a table cell with a ratio as per cent and as a bar, and a few small words."""
+def bar_cell(value: float | None, note: str = "", *, few: bool = False) -> str:
+    """Return a table cell with a ratio as per cent and as a bar, and a few small words; grey if from few images."""
     if value is None or math.isnan(value):
         return '<td class="n">-</td>'
     width = max(0.0, min(1.0, value)) * 100
     bar = f'<span class="track"><span class="bar" style="width:{width:.1f}%"></span></span>'
     words = f'<span class="note">{escape(note)}</span>' if note else ""
-    return f'<td class="n">{percent(value)}{bar}{words}</td>'
+    return f'<td class="n{" few" if few else ""}">{percent(value)}{bar}{words}</td>'
 
 
 def table(head: str, body: str, *, framed: bool = False) -> str:

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import TASKS, Task
-from trilitenet.data.reading import decode
+from trilitenet.data.reading import decode_grey
 from trilitenet.errors import DataError, OutputError, brief, part_of, write_file, writing
 from trilitenet.structures import Boxes, Perception
 
@@ -190,7 +190,7 @@ class SavedPredictions:
             tasks: What of it is read; nothing is said of others.
 
         Raises:
-            DataError: If a mask is missing, broken or of another size.
+            DataError: If a mask is missing, broken, of another size or of more than 8 bits a pixel.
         """
         present = set(tasks) & set(self.tasks)
         boxes = self._boxes.get(name, Boxes.empty()) if "detection" in present else None
@@ -206,7 +206,7 @@ class SavedPredictions:
         path = self.folder / task / f"{name}.png"
         if not path.is_file():
             raise DataError(f"{path}: missing; every image needs a mask (an empty one where nothing is predicted)")
-        grey = decode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+        grey = decode_grey(np.fromfile(path, np.uint8), str(path))
         if grey is None:
             raise DataError(f"{path}: not an image that can be decoded")
         if grey.shape != size:
@@ -244,6 +244,8 @@ class SavedPredictions:
                 number = self._class(category, path)
                 if not all(abs(value) < 1e9 for value in (left, top, width, height)):
                     raise DataError(f"{path}: a bbox must be four numbers of pixels, got {entry['bbox']}")
+                if width < 0 or height < 0:
+                    raise DataError(f"{path}: a bbox is left, top, width, height, got {entry['bbox']}")
                 score = float(entry["score"])
                 if not 0 <= score <= 1:
                     raise DataError(f"{path}: a score must be between 0 and 1, got {score}")

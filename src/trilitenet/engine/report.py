@@ -10,7 +10,7 @@ import shutil
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 from rich import box
@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from trilitenet.config import parse, parse_json
+from trilitenet.config import Task, parse, parse_json
 from trilitenet.engine.figures import CONDITION_FIGURES, HEADLINES, meaning
 from trilitenet.engine.page import percent
 from trilitenet.engine.scoring import FairMetrics, FairScores, PaperMetrics, PaperScores
@@ -47,7 +47,7 @@ FEW_IMAGES: Final = 30
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
-    """A value and its 95% bootstrap interval by image.
+    """A value and its 95% bootstrap interval.
 
     Attributes:
         value: In [0, 1]; NaN where undefined.
@@ -76,17 +76,24 @@ class Condition:
         value: For example ``"night"``.
         images: How many images have it.
         figures: Figure key -> value.
+        labelled: Task -> how many of the images are labelled for it.
     """
 
     attribute: str
     value: str
     images: int
     figures: dict[str, float]
+    labelled: dict[Task, int] = dataclasses.field(default_factory=dict)
 
     @property
     def few(self) -> bool:
         """Whether there are too few images to say much."""
         return self.images < FEW_IMAGES
+
+    def few_for(self, key: str) -> bool:
+        """Return whether too few of the images are labelled for a figure's task."""
+        task = cast("Task", key.split("/")[1])
+        return self.labelled.get(task, self.images) < FEW_IMAGES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,6 +209,9 @@ class Report:
         plots: Of detection; None without it.
         worst: The images that went worst, a task after the other.
         names: The images, in order.
+        groups: The number of each image's group, which is drawn as a whole for the intervals; empty where each image is
+            drawn by itself.
+        group: The attribute that makes the groups; ``"image"`` where each image is drawn by itself.
         state: Counts an image, from which every figure can be computed again.
         variations: Figures on corrupted images and at other input sizes, where measured.
     """
@@ -216,6 +226,18 @@ class Report:
     names: tuple[str, ...]
     state: dict[str, Any] = dataclasses.field(repr=False)
     variations: tuple[Variation, ...] = ()
+    groups: tuple[int, ...] = ()
+    group: str = "image"
+
+    @property
+    def drawn(self) -> str:
+        """What the intervals are drawn from, in words."""
+        if not self.groups:
+            return "1 image, which gives none" if len(self.names) == 1 else f"{len(self.names)} images"
+        count = len(set(self.groups))
+        if count == 1:
+            return f"1 group of images (by {self.group}), which gives none; --group image draws each by itself"
+        return f"{count} groups of images (by {self.group})"
 
     @property
     def protocols(self) -> tuple[str, ...]:
@@ -247,6 +269,8 @@ class Report:
             ],
             "variations": [dataclasses.asdict(variation) for variation in self.variations],
             "images": list(self.names),
+            "groups": list(self.groups),
+            "group": self.group,
             "state": self.state,
         }
         return dict(without_nan(mapping))
@@ -274,6 +298,8 @@ class Report:
         tables: list[Table | Text] = [_provenance_text(self.provenance)]
         for protocol in self.protocols:
             tables.append(_figure_table(protocol, self.figures))
+        if any(figure.low is not None for figure in self.figures.values()):
+            tables.append(Text(f"intervals: drawn from {self.drawn}"))
         tables.append(_exclusions(self))
         tables += [_condition_table(protocol, self.conditions) for protocol in self.protocols if self.conditions]
         tables += _variation_tables(self.variations)
@@ -321,7 +347,7 @@ def _figure_table(protocol: str, figures: Mapping[str, Figure]) -> Table:
 
 def _condition_table(protocol: str, conditions: tuple[Condition, ...]) -> Table:
     keys = [key for key in CONDITION_FIGURES[protocol] if any(key in row.figures for row in conditions)]
-    table = titled_table(f"by condition, {protocol} (per cent; in brackets: under {FEW_IMAGES} images)")
+    table = titled_table(f"by condition, {protocol} (per cent; in brackets: under {FEW_IMAGES} labelled images)")
     table.add_column("condition")
     table.add_column("value")
     table.add_column("images", justify="right")
@@ -330,8 +356,7 @@ def _condition_table(protocol: str, conditions: tuple[Condition, ...]) -> Table:
     last = ""
     for row in conditions:
         cells = [percent(row.figures.get(key)) for key in keys]
-        if row.few:
-            cells = [f"({cell})" for cell in cells]
+        cells = [f"({cell})" if row.few_for(key) else cell for key, cell in zip(keys, cells, strict=True)]
         table.add_row(
             row.attribute if row.attribute != last else "",
             row.value,
@@ -415,6 +440,7 @@ def read_report(path: Path) -> Report:
                     row["value"],
                     row["images"],
                     {key: _number(value) for key, value in row["figures"].items()},
+                    dict(row.get("labelled", {})),
                 )
                 for row in mapping["conditions"]
             ),
@@ -424,6 +450,8 @@ def read_report(path: Path) -> Report:
                 for frame in mapping["worst"]
             ),
             names=names,
+            groups=_groups(mapping.get("groups", []), len(names)),
+            group=str(mapping.get("group", "image")),
             state=state,
             variations=tuple(
                 Variation(
@@ -447,6 +475,17 @@ def read_report(path: Path) -> Report:
 def _metrics(state: Mapping[str, Any]) -> dict[str, FairMetrics | PaperMetrics]:
     readers: dict[str, Any] = {"fair": FairMetrics.from_state, "paper": PaperMetrics.from_state}
     return {name: readers[name]({**part}) for name, part in state.items()}
+
+
+def _groups(numbers: list[int], images: int) -> tuple[int, ...]:
+    """Return the groups of a report's images.
+
+    Raises:
+        ValueError: If they are not as many numbers, 0 and up, as there are images.
+    """
+    if numbers and (len(numbers) != images or not all(isinstance(one, int) and 0 <= one < images for one in numbers)):
+        raise ValueError("groups are not one number an image")
+    return tuple(numbers)
 
 
 def _plots(mapping: Mapping[str, Any]) -> DetectionPlots:

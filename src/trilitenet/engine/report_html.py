@@ -164,7 +164,7 @@ def _conditions(report: Report, protocol: str) -> str:
     for attribute, members in groups.items():
         rows = "".join(
             f'<tr{" class=few" if row.few else ""}><td>{escape(row.value)}</td><td class="n">{row.images}</td>'
-            + "".join(bar_cell(row.figures.get(key)) for key in keys)
+            + "".join(bar_cell(row.figures.get(key), few=row.few_for(key)) for key in keys)
             + "</tr>"
             for row in members
         )
@@ -173,7 +173,7 @@ def _conditions(report: Report, protocol: str) -> str:
     return section(
         f"By condition, {protocol} protocol",
         f'<div class="stack">{"".join(cards)}</div>',
-        f"Per cent. Grey: under {FEW_IMAGES} images, too few to say much.",
+        f"Per cent. Grey: under {FEW_IMAGES} labelled images, too few to say much.",
     )
 
 
@@ -220,6 +220,7 @@ def _provenance(report: Report) -> str:
         *((f"SHA-256 of {name}", value) for name, value in known.data_sha256.items()),
         ("thresholds", ", ".join(f"{name} {value:g}" for name, value in known.thresholds.items())),
         ("settings", ", ".join(f"{name} {value}" for name, value in known.settings.items())),
+        *((("intervals", f"drawn from {report.drawn}"),) if known.settings.get("resamples") else ()),
         ("canvas", ", ".join(known.canvas)),
         ("versions", ", ".join(f"{name} {value}" for name, value in known.versions.items())),
         ("hardware", known.hardware),

@@ -21,13 +21,17 @@ from trilitenet.metrics.bootstrap import bootstrap, interval
 from trilitenet.metrics.detection import DetectionMetric
 from trilitenet.structures import Perception
 
-__all__ = ["CONDITIONS", "PAPER_THRESHOLDS", "PROTOCOLS", "Scorecard"]
+__all__ = ["BY_IMAGE", "CONDITIONS", "GROUP", "PAPER_THRESHOLDS", "PROTOCOLS", "Scorecard"]
 
 _LOGGER: Final = logging.getLogger(__name__)
 
 PROTOCOLS: Final = ("paper", "fair", "both")
 CONDITIONS: Final = ("timeofday", "weather", "scene")
 """Attributes that tables are made by, in the paper's order."""
+GROUP: Final = "sequence"
+"""Attribute whose images are drawn together for the intervals: frames of one drive are much alike."""
+BY_IMAGE: Final = "image"
+"""In its place: each image by itself."""
 PAPER_THRESHOLDS: Final = Thresholds(confidence=0.001, iou=0.6, max_boxes=300, drivable=0.5, lane=0.5)
 """What the published evaluation decides with."""
 _CURVE_POINTS: Final = 400
@@ -44,6 +48,8 @@ class Scorecard:
         paper_batch: Images a batch of the published averages.
         worst: How many of the worst images to keep pictures of, a task; 0 for none.
         by: Attributes to make tables by.
+        group: Images of one value of this attribute are drawn together for the intervals, those without it each by
+            itself; ``"image"`` draws each by itself.
 
     Raises:
         ConfigError: If there is no such protocol.
@@ -59,6 +65,7 @@ class Scorecard:
         paper_batch: int = 16,
         worst: int = 24,
         by: Sequence[str] = CONDITIONS,
+        group: str = GROUP,
     ) -> None:
         if protocol not in PROTOCOLS:
             raise ConfigError(f"unknown protocol {protocol!r}; known: {', '.join(PROTOCOLS)}")
@@ -73,6 +80,9 @@ class Scorecard:
         self._by = tuple(dict.fromkeys(by))
         self._names: list[str] = []
         self._values: dict[str, list[str]] = {attribute: [] for attribute in self._by}
+        self._group = group
+        self._groups: list[str] = []
+        self._labelled: list[list[bool]] = []  # an image: whether it has labels, a task
         self._known: set[str] = set()
         self._worst: dict[Task, list[tuple[float, int, int, WorstFrame]]] = {task: [] for task in self.tasks}
         self._serial = itertools.count()
@@ -89,6 +99,9 @@ class Scorecard:
         self._known |= sample.attributes.keys()
         for attribute in self._by:
             self._values[attribute].append(sample.attributes.get(attribute, "") or "undefined")
+        labels = {"detection": sample.boxes, "drivable": sample.drivable, "lane": sample.lane}
+        self._labelled.append([labels[task] is not None for task in self.tasks])
+        self._groups.append("" if self._group == BY_IMAGE else sample.attributes.get(self._group, ""))
         if self.fair is not None and prediction is not None:
             outcome = self.fair.update(sample, prediction)
             if self._keep:
@@ -138,6 +151,7 @@ class Scorecard:
         if not count:
             raise DataError("no images to score")
         metrics = {"fair": self.fair, "paper": self.paper}
+        groups = self._numbered_groups()
         figures: dict[str, Figure] = {}
         rows = self._condition_rows()
         members = np.array([where for _, _, where in rows], np.int32).reshape(len(rows), count)
@@ -146,7 +160,7 @@ class Scorecard:
             if metric is None:
                 continue
             plain = metric.figures()  # before the resampling, whose threads would each rank the boxes first
-            spread = bootstrap(metric.figures, count, resamples, seed)
+            spread = bootstrap(metric.figures, count, resamples, seed, groups or None)
             for name, value in plain.items():
                 low, high = interval(spread[name]) if resamples else (None, None)
                 figures[f"{protocol}/{name}"] = Figure(float(value[0]), low, high)
@@ -155,13 +169,14 @@ class Scorecard:
                     for table, value in zip(tables, values, strict=True):
                         table[f"{protocol}/{name}"] = float(value)
         fair, paper = self.fair, self.paper
+        labelled = members @ np.array(self._labelled, np.int64).reshape(count, len(self.tasks))
         return Report(
             fair=None if fair is None else fair.compute(),
             paper=None if paper is None else paper.compute(),
             figures=figures,
             conditions=tuple(
-                Condition(attribute, value, int(sum(where)), table)
-                for (attribute, value, where), table in zip(rows, tables, strict=True)
+                Condition(attribute, value, int(sum(where)), table, dict(zip(self.tasks, map(int, own), strict=True)))
+                for (attribute, value, where), table, own in zip(rows, tables, labelled, strict=True)
             ),
             plots=None if fair is None or fair.detection is None else _detection_plots(fair.detection),
             worst=tuple(
@@ -170,9 +185,22 @@ class Scorecard:
                 for entry in sorted(self._worst[task], key=lambda entry: entry[:3])[::-1]
             ),
             names=tuple(self._names),
+            groups=groups,
+            group=self._group if groups else BY_IMAGE,
             state={name: metric.state() for name, metric in metrics.items() if metric is not None},
             provenance=provenance(count),
         )
+
+    def _numbered_groups(self) -> tuple[int, ...]:
+        """Return the number of each image's group, in order of their first images; nothing where each is its own."""
+        if not any(self._groups):
+            if self._group not in {GROUP, BY_IMAGE}:
+                hint = did_you_mean(self._group, self._known)
+                _LOGGER.warning("no image has the attribute %r to draw by%s", self._group, hint)
+            return ()
+        numbers: dict[tuple[str, int], int] = {}
+        keys = [(value, -1 if value else index) for index, value in enumerate(self._groups)]
+        return tuple(numbers.setdefault(key, len(numbers)) for key in keys)
 
     def _condition_rows(self) -> list[tuple[str, str, list[int]]]:
         """Return attribute, value and membership of every image, for attributes that some image has."""

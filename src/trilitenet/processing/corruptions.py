@@ -2,8 +2,9 @@
 
 The strengths are theirs, in pixels of the image as stored, as usual for larger images (Michaelis et al., 2019). The
 packages that offer them depend on the windowed build of OpenCV, hence this implementation. Three differences: the
-frost is a procedural texture instead of photographs; glass blur displaces all pixels at once instead of swapping them
-one after the other; and the elastic transform has no affine part, because boxes and masks stay where they are.
+frost is a procedural texture instead of photographs; glass blur displaces all pixels at once, to all sides alike,
+instead of swapping them one after the other; and the elastic transform has no affine part, because boxes and masks
+stay where they are.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ def _glass_blur(image: FloatImage, level: int, rng: Rng) -> FloatImage:
     height, width = image.shape[:2]
     rows, columns = np.mgrid[:height, :width].astype(np.float32)
     for _ in range(rounds):
-        shift = rng.integers(-reach, reach, (2, height, width)).astype(np.float32)
+        shift = rng.integers(-reach, reach, (2, height, width), endpoint=True).astype(np.float32)
         result = cv2.remap(result, columns + shift[0], rows + shift[1], cv2.INTER_NEAREST, None, cv2.BORDER_REFLECT)
     return np.asarray(cv2.GaussianBlur(result, (0, 0), sigma), np.float32)
 
@@ -204,11 +205,12 @@ def _smooth(noise: FloatImage, sigma: float) -> FloatImage:
 
 
 def _streak(radius: int, sigma: float, angle: float) -> FloatImage:
-    """Return a motion-blur kernel: weights fall from one end to the other of a line through the middle."""
-    side = 2 * radius + 1
+    """Return the published motion-blur kernel: 2 radius + 1 weights that fall from the middle on, to one side."""
+    length = 2 * radius
+    side = 2 * length + 1
     line = np.zeros((side, side), np.float32)
-    line[radius, radius:] = np.exp(-0.5 * (np.arange(radius + 1) / sigma) ** 2)
-    turn = cv2.getRotationMatrix2D((radius, radius), angle, 1)
+    line[length, length:] = np.exp(-0.5 * (np.arange(length + 1) / sigma) ** 2)
+    turn = cv2.getRotationMatrix2D((length, length), angle, 1)
     kernel = cv2.warpAffine(line, turn, (side, side), flags=cv2.INTER_LINEAR)
     return np.asarray(kernel / kernel.sum(), np.float32)
 
