@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import functools
+import http.server
 import io
 import itertools
 import json
@@ -8,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from fractions import Fraction
@@ -24,6 +27,7 @@ from trilitenet.apps import cli
 from trilitenet.commands import predict as command
 from trilitenet.commands.predict import RoadOptions, predict_with
 from trilitenet.errors import BackendError, ConfigError, InputError, MissingExtraError, OutputError, ShapeError
+from trilitenet.formats.writers.native import JsonWriter
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, VideoReader
 from trilitenet.inference.video import VideoWriter
@@ -390,6 +394,41 @@ def test_a_shard_opens_neither_what_others_do_nor_what_is_done(
     assert opened == read == ["1", "3"]
 
 
+def test_a_url_that_does_not_answer_keeps_its_place_in_every_shard(tmp_path: Path, predictor: Predictor) -> None:
+    for index in range(4):
+        (tmp_path / "www" / str(index)).mkdir(parents=True)
+        drive(tmp_path / "www" / str(index) / "front.mp4", 2)
+    asked: list[str] = []
+    down = {"/0/front.mp4"}
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        def do_GET(self) -> None:
+            asked.append(self.path)
+            if self.path in down:
+                self.send_error(503)
+            else:
+                super().do_GET()
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0), functools.partial(Handler, directory=str(tmp_path / "www"))
+    ) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        urls = [f"http://127.0.0.1:{server.server_port}/{index}/front.mp4" for index in range(4)]
+        options: dict[str, Any] = {"overlay": False, "skip_existing": True}
+        for index, failed in ((0, 1), (1, 0), (0, 0)):
+            asked.clear()
+            report = predict_with(predictor, urls, tmp_path / "out", shard=f"{index}/2", **options)
+            assert len(report.failures) == failed
+            assert {int(path[1]) for path in asked} == {index} | ({index + 2} if index or failed else set())
+            down.clear()
+        server.shutdown()
+    names = ("front", "front-2", "front-3", "front-4")
+    assert [json.loads((tmp_path / "out" / f"{name}.json").read_text())["source"] for name in names] == urls
+
+
 def test_of_many_sources_few_bars_are_shown(
     tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -486,11 +525,35 @@ def test_the_mark_of_a_video_that_failed_is_there_before_its_results(
     assert {path.name for path in output.glob("*.part")} == {"a.unfinished.part"}
 
 
+def test_a_file_of_all_sources_is_marked_until_it_has_them_all(
+    folder: Path, tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = tmp_path / "out"
+    formats = ("parquet", "jsonl", "json")
+    marks = {f"perceptions.{ending}.unfinished.part" for ending in ("parquet", "jsonl")}
+    with monkeypatch.context() as patch:
+        write, done = JsonWriter._write, itertools.count(1)
+
+        def interrupted(self: JsonWriter, *arguments: Any) -> None:
+            write(self, *arguments)
+            if next(done) == 2:
+                signal.default_int_handler(signal.SIGINT, None)
+
+        patch.setattr(JsonWriter, "_write", interrupted)
+        report = predict_with(predictor, [folder], output, format=formats)
+    assert report.exit_code == 130
+    assert [path.name for path in report.partial] == ["perceptions.parquet", "perceptions.jsonl"]
+    assert "perceptions.parquet and perceptions.jsonl without the rest: make anew with --overwrite" in report.summary()
+    assert {path.name for path in output.glob("*.part")} == marks
+    whole = predict_with(predictor, [folder], output, format=formats, overwrite=True)
+    assert (whole.partial, list(output.glob("*.part"))) == ((), [])
+
+
 @pytest.mark.parametrize("format", ["jsonl", "csv", "coco", "yolo", "cvat"])
 def test_results_of_several_sources_in_one_file_cannot_be_skipped(
     format: str, folder: Path, tmp_path: Path, predictor: Predictor
 ) -> None:
-    with pytest.raises(ConfigError, match=f"--skip-existing needs .* and {format} has one "):
+    with pytest.raises(ConfigError, match=r"--skip-existing needs .* is one for all"):
         predict_with(predictor, [folder], tmp_path / "out", format=("json", format), skip_existing=True)
     with pytest.raises(ConfigError, match="exclude each other"):
         predict_with(predictor, [folder], tmp_path / "out", skip_existing=True, overwrite=True)
@@ -615,6 +678,39 @@ def test_results_of_every_format_are_refused_before_the_work(
         predict_with(predictor, sources, output, format=(format,), overlay=False)
     assert [path for path in output.rglob("*") if path.is_file()] == [output / there]
     assert (output / there).read_text() == "mine"
+
+
+def test_labels_that_an_earlier_run_left_of_a_video_go_once_it_is_done(
+    tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, output = drive(tmp_path / "drive.mp4", frames=6), tmp_path / "out"
+
+    def run(**options: Any) -> list[int]:
+        predict_with(predictor, [source], output, format=("yolo",), **options)
+        return sorted(int(path.stem[-7:]) for path in (output / "labels").iterdir())
+
+    assert run(overlay=False) == [0, 1, 2, 3, 4, 5]
+    with monkeypatch.context() as patch:
+        patch.setattr(VideoWriter, "write", write_until(2, lambda: signal.default_int_handler(signal.SIGINT, None)))
+        assert run(overwrite=True) == [0, 1, 2, 3, 4, 5]
+    assert run(overwrite=True, clip=Clip(every=3)) == [0, 3]
+
+
+def test_a_source_too_large_for_its_overlay_does_not_stop_the_others(
+    tmp_path: Path, predictor: Predictor, capfd: pytest.CaptureFixture[str]
+) -> None:
+    large, wide, small = tmp_path / "a.png", tmp_path / "w1.png", tmp_path / "z.png"
+    Image.new("RGB", (65_501, 8)).save(large)
+    Image.new("RGB", (16_386, 8)).save(wide)
+    Image.fromarray(coloured_scene()).save(small)
+    report = predict_with(predictor, [large, tmp_path / "w%d.png", small], tmp_path / "out")
+    assert (report.images, report.videos, report.exit_code) == (2, 1, 1)
+    assert [Path(failure.source).name for failure in report.failures] == ["a.png", "w"]
+    for failure, told in zip(report.failures, ("JPEG does not take 65501 x 8", "16384 pixels a side"), strict=True):
+        assert failure.reason.startswith(f"{failure.source}: an overlay cannot be made (")
+        assert told in failure.reason
+    assert {"a.json", "z.json", "z.jpg"} <= {path.name for path in (tmp_path / "out").iterdir()}
+    assert capfd.readouterr().err == ""
 
 
 def test_a_picture_of_another_shape_than_the_camera_does_not_stop_the_others(

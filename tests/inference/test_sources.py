@@ -504,6 +504,26 @@ def test_a_url_without_an_end_is_a_stream_and_one_without_an_answer_is_told_with
     assert not {"secret", "token"} & set(re.findall(r"\w+", f"{failure.source} {failure.reason}"))
 
 
+def test_a_url_may_be_left_alone_until_it_is_wanted(tmp_path: Path) -> None:
+    data = video(tmp_path / "a.mp4", frames=5).read_bytes()
+    for parts, length, live in (([data] * 3, len(data), False), ([transport_stream(0, 5)] * 2, 0, True)):
+        with Server(parts, length=length) as server:
+            (first, second), failures = find_sources([server.url, f"{server.url}&y"], unopened=True)
+            assert isinstance(second, StreamReader)
+            assert not failures
+            assert server.connections == 0
+            second.retries = 0
+            second.look()
+            assert (second.live, second.expected) == (live, None if live else 5)
+            frames = list(second)
+            assert [index_of(frame) for frame in frames] == [frame.index for frame in frames]
+            assert len(frames) >= (4 if live else 5)  # the last may be lost where a stream breaks
+            assert {frame.source for frame in frames} == {f"{server.url[:7]}{server.url[19:-8]}-2"}
+            assert isinstance(first, FrameReader)
+            with pytest.raises(InputError, match=rf"^{re.escape(first.name)}: is not a video"):
+                list(first)
+
+
 def test_each_frame_of_a_stream_is_there_as_soon_as_it_came(tmp_path: Path) -> None:
     video(tmp_path / "a.mp4", frames=3)
     for live, kind in ((True, "SLICE"), (False, "AUTO")):

@@ -276,6 +276,35 @@ def test_time_stamps_that_stand_still_or_go_back_are_mended(tmp_path: Path) -> N
     assert times == sorted(set(times))
 
 
+@pytest.mark.parametrize(
+    ("given", "written"),
+    [
+        ([2.5, 2.6, 2.9], [0.0, 0.1, 0.4]),
+        ([1.0, 0.5, 1.2], [0.0, 1 / 90_000, 0.2]),
+        ([5.0, 30_005.0, 30_005.1, 90_000.0, 90_001.0], [0.0, 1000.0, 1000.1, 2000.1, 2001.1]),
+    ],
+)
+def test_a_video_begins_with_its_first_frame_and_shows_none_for_hours(
+    tmp_path: Path, given: list[float], written: list[float]
+) -> None:
+    with VideoWriter(tmp_path / "a.mp4") as writer:
+        for timestamp in given:
+            writer.write(coloured_scene(32, 32), timestamp)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert [float(frame.time) for frame in container.decode(video=0)] == pytest.approx(written, abs=1e-5)
+
+
+@pytest.mark.parametrize("rate", [1e-9, 0.0001, 0.0004, 1000.0])
+def test_any_rate_can_be_written(tmp_path: Path, rate: float) -> None:
+    with VideoWriter(tmp_path / "a.mp4", rate) as writer:
+        for _ in range(6):
+            writer.write(coloured_scene(32, 32))
+    times = [frame.timestamp for frame in VideoReader(tmp_path / "a.mp4")]
+    assert times == pytest.approx([i * min(1000, 1 / rate) for i in range(6)])
+    with av.open(str(tmp_path / "a.mp4")) as container:  # the last is shown as long as the others
+        assert container.duration / 1e6 == pytest.approx(6 * min(1000, 1 / rate))
+
+
 def test_a_change_of_size_is_brought_to_the_first(tmp_path: Path) -> None:
     with VideoWriter(tmp_path / "a.mp4") as writer:
         writer.write(coloured_scene(64, 96))
@@ -321,6 +350,8 @@ def test_a_video_of_another_kind_or_without_time_is_refused(
 
 def test_a_frame_that_is_no_picture_takes_nothing_from_the_video(tmp_path: Path) -> None:
     with VideoWriter(tmp_path / "a.mp4") as writer:
+        with pytest.raises(ShapeError, match=r"H\.264 takes at most 16384 pixels a side, got 16385 x 8"):
+            writer.write(np.zeros((8, 16385, 3), np.uint8))
         writer.write(coloured_scene(32, 32))
         for wrong in (np.zeros((32, 32, 3)), np.zeros((32, 32, 2), np.uint8), np.zeros((0, 32, 3), np.uint8)):
             with pytest.raises(ShapeError, match="an image must be"):

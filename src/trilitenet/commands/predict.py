@@ -37,7 +37,7 @@ from trilitenet.errors import (
 )
 from trilitenet.formats.writers.base import Writer, file_stem, find_writer, open_writer, uninterrupted
 from trilitenet.inference.predictor import Predictor
-from trilitenet.inference.sources import Clip, Failure, FrameReader, Stills, find_sources
+from trilitenet.inference.sources import Clip, Failure, FrameReader, Stills, find_sources, silent_opencv
 from trilitenet.inference.video import PerceptionStream, VideoWriter
 from trilitenet.processing.drawing import PARTS, check_parts, draw
 from trilitenet.processing.geometry import Camera
@@ -121,6 +121,7 @@ class PredictReport:
         output: The folder of all results.
         interrupted: Whether it was stopped by Ctrl-C; what was written until then is whole.
         skipped: Sources that were left out because their results exist.
+        partial: Files of all sources together that hold some of them alone, for it was interrupted.
     """
 
     images: int
@@ -132,6 +133,7 @@ class PredictReport:
     output: Path
     interrupted: bool = False
     skipped: int = 0
+    partial: tuple[Path, ...] = ()
 
     @property
     def exit_code(self) -> int:
@@ -156,7 +158,9 @@ class PredictReport:
         what = f"{', '.join(done)} at {speed:.1f} a second -> {self.output}" if done else "nothing was predicted"
         skipped = f"; {self.skipped} skipped, done already" if self.skipped else ""
         failed = f"; {len(self.failures)} failed" if self.failures else ""
-        return f"{'interrupted: ' if self.interrupted else ''}{what}{skipped}{failed}"
+        names = " and ".join(path.name for path in self.partial)
+        partial = f"; {names} without the rest: make anew with --overwrite" if names else ""
+        return f"{'interrupted: ' if self.interrupted else ''}{what}{skipped}{failed}{partial}"
 
 
 @one_for_several
@@ -356,6 +360,8 @@ class _Job:
         self.images = self.videos = self.frames = 0
         self.files: list[Path] = []
         self.unfinished: dict[str, bool] = {}
+        self.marked = self.whole = False
+        self.gathered = [self.output / file for file in self._gathered()]
 
     def _leave_out_long_names(self) -> None:
         """Make a source whose results would have longer names than file systems take a failure of its own."""
@@ -385,15 +391,11 @@ class _Job:
             ConfigError: If a format gathers several sources in one file.
             OutputError: If results that are there say that they are of another source of the same name.
         """
-        for name in self.formats:
-            writer = find_writer(name)
-            patterns = {pattern for source in self.sources for pattern in _patterns(writer, source)}
-            for pattern in (*writer.FILES, *sorted(patterns)):
-                if "{}" not in pattern:
-                    raise ConfigError(
-                        f"--skip-existing needs formats with a file for each source, and {name} has one {pattern} for "
-                        "all; choose another --format, or --overwrite"
-                    )
+        for file in self._gathered():
+            raise ConfigError(
+                f"--skip-existing needs formats with a file for each source, and {file} is one for all; choose another "
+                "--format, or --overwrite"
+            )
         if "json" in self.formats:
             for name in self._left():
                 _check_source(self.output / f"{self.stems[name]}.json", name)
@@ -431,6 +433,27 @@ class _Job:
     def _mark(self, name: str) -> Path:
         """Return the file that is there while the results of a video are not of all its frames."""
         return part_of(self.output / f"{self.stems[name]}.unfinished")
+
+    def _gathered(self) -> Iterator[str]:
+        """Yield the names of the files that hold several sources."""
+        for name in self.formats:
+            writer = find_writer(name)
+            patterns = {pattern for source in self.sources for pattern in _patterns(writer, source)}
+            yield from (pattern for pattern in (*writer.FILES, *sorted(patterns)) if "{}" not in pattern)
+
+    def _mark_gathered(self) -> None:
+        """Leave the marks of the files of all sources, which hold but some of them until the run's end."""
+        self.marked = True
+        for file in self.gathered:
+            with writing(file):
+                _mark_of(file).touch()
+
+    def _remove_gathered_marks(self) -> None:
+        """Remove the marks of files that hold all sources, and of those that were not written."""
+        for file in self.gathered if self.marked else ():
+            if self.whole or not file.exists():
+                with writing(file):
+                    _mark_of(file).unlink(missing_ok=True)
 
     def _mark_unfinished(self, name: str) -> None:
         """Leave the mark of a video that was not done to its end."""
@@ -499,6 +522,7 @@ class _Job:
         with contextlib.ExitStack() as stack:
             stack.enter_context(writing(self.output))
             stack.callback(self._remove_marks)  # once all files have their names
+            stack.callback(self._remove_gathered_marks)
             if self.sources:
                 self.output.mkdir(parents=True, exist_ok=True)
                 for name in self.formats:
@@ -519,6 +543,7 @@ class _Job:
                         for task in progress.task_ids[1:]:
                             progress.remove_task(task)
                         progress.advance(all_of_them)
+                self.whole = True
             except _WindowClosed:
                 pass
             except KeyboardInterrupt:
@@ -533,6 +558,7 @@ class _Job:
             output=self.output,
             interrupted=interrupted,
             skipped=self.skipped,
+            partial=tuple(self.gathered) if self.marked and not self.whole else (),
         )
 
     def _run_source(self, source: Stills | FrameReader, predictor: Predictor, progress: Progress) -> None:
@@ -576,6 +602,8 @@ class _Job:
                             self._take(perception, road, video)
                     progress.advance(task)
                 if isinstance(source, FrameReader):
+                    for writer in self.writers:
+                        writer.remove_remains(source.name)
                     self.unfinished[source.name] = False
             except InputError as error:
                 assert isinstance(source, FrameReader)
@@ -586,8 +614,14 @@ class _Job:
         progress.update(task, total=next(bar.completed for bar in progress.tasks if bar.id == task))
 
     def _take(self, perception: Perception, road: Road | None, video: VideoWriter | None) -> None:
-        """Write and draw one perception; an interruption waits, so that no result is a frame ahead of another."""
+        """Write and draw one perception; an interruption waits, so that no result is a frame ahead of another.
+
+        Raises:
+            InputError: If the frames of a video are too large for an overlay; a picture that is becomes a failure.
+        """
         with uninterrupted():
+            if not self.marked:
+                self._mark_gathered()
             for writer in self.writers:
                 writer.write(perception, None if road is None else road.to_dict())
             if perception.frame is None:
@@ -601,13 +635,21 @@ class _Job:
             picture = draw(perception, hide=[part for part in self.hide if part in PARTS], out=perception.image)
             if road is not None:
                 draw_road(picture, perception, road, hide=[part for part in self.hide if part in ROAD_PARTS])
+            cure = "add --no-overlay for the other results alone"
             if video is not None:
-                video.write(picture, perception.timestamp)
+                try:
+                    video.write(picture, perception.timestamp)
+                except ShapeError as error:
+                    raise InputError(f"{perception.source}: an overlay cannot be made ({error}); {cure}") from error
             elif self.overlay and perception.frame is None:
                 assert perception.source is not None
                 path = self.output / f"{self.stems[perception.source]}.jpg"
-                _write_jpeg(path, picture)
-                self.files.append(path)
+                if _write_jpeg(path, picture):
+                    self.files.append(path)
+                else:
+                    height, width = picture.shape[:2]
+                    reason = f"an overlay cannot be made (JPEG does not take {width} x {height} pixels); {cure}"
+                    self.failures.append(Failure(perception.source, f"{perception.source}: {reason}"))
         if self.window is not None:
             self.window.show(picture)
 
@@ -670,6 +712,11 @@ def _check_source(path: Path, name: str) -> None:
         )
 
 
+def _mark_of(file: Path) -> Path:
+    """Return the file that is there while one of several sources lacks some of them."""
+    return part_of(file.with_name(f"{file.name}.unfinished"))
+
+
 def _names(source: Stills | FrameReader) -> list[str]:
     return [str(path) for path in source.paths] if isinstance(source, Stills) else [source.name]
 
@@ -689,13 +736,15 @@ def _allot_stems(names: Sequence[str]) -> dict[str, str]:
     return {name: free.give(file_stem(name)) for name in dict.fromkeys(names)}
 
 
-def _write_jpeg(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write (height, width, 3) uint8 RGB so that the file is whole or not there."""
-    done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    if not done:
-        raise OutputError(f"{path}: the overlay cannot be encoded as JPEG")
-    with replacing(path) as part:
-        part.write_bytes(data.tobytes())
+def _write_jpeg(path: Path, image: NDArray[np.uint8]) -> bool:
+    """Write (height, width, 3) uint8 RGB so that the file is whole or not there; False if JPEG cannot hold it."""
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    with silent_opencv():
+        done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    if done:
+        with replacing(path) as part:
+            part.write_bytes(data.tobytes())
+    return done
 
 
 class _Speed(ProgressColumn):

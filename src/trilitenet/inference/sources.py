@@ -46,6 +46,7 @@ __all__ = [
     "StreamReader",
     "VideoReader",
     "find_sources",
+    "silent_opencv",
 ]
 
 VIDEO_SUFFIXES: Final = frozenset(
@@ -383,6 +384,39 @@ class StreamReader(FrameReader):
         _LOGGER.warning("%s: given up after %d attempts (%s)", self.name, self.retries, reason)
 
 
+class _UrlReader(VideoReader, StreamReader):
+    """A file behind an HTTP or FTP URL, which has an end, or a live stream; `look` or the first frame finds out which.
+
+    Args:
+        url: The address, which is left alone until then.
+        clip: Which frames are wanted.
+
+    Raises:
+        MissingExtraError: If PyAV is not installed.
+    """
+
+    def __init__(self, url: str, clip: Clip | None = None) -> None:
+        super().__init__(url, clip, timeout=_PATIENCE, unopened=True)
+        self._url = url  # whole: `VideoReader` passes the name on
+
+    def look(self) -> None:
+        """Find out which it is, and of a file ``rate`` and ``expected``.
+
+        Raises:
+            InputError: If it cannot be read.
+        """
+        with self._open() as container:
+            self.live = not _has_end(container)
+        if not self.live:
+            super().look()
+        self._unopened = False
+
+    def _decode(self) -> Any:
+        if self._unopened:
+            self.look()
+        return StreamReader._decode(self) if self.live else VideoReader._decode(self)
+
+
 class CameraReader(FrameReader):
     """A camera of this machine, by its number.
 
@@ -402,7 +436,7 @@ class CameraReader(FrameReader):
         self.expected = self.clip.expected(None, None)
 
     def _decode(self) -> Any:
-        with _silent_opencv():
+        with silent_opencv():
             camera = cv2.VideoCapture(self._number)
         try:
             if not camera.isOpened():
@@ -488,7 +522,7 @@ def find_sources(
             pictures (``%06d``), URLs, a camera's number, ``-`` or ``stdin`` for standard input.
         clip: Which frames of videos are wanted.
         rate: Frames a second of numbered pictures.
-        unopened: Do not open video files: what is wrong with them is told by `FrameReader.look`.
+        unopened: Open neither video files nor URLs: what is wrong with them is told by `FrameReader.look`.
 
     Returns:
         The sources in order, each once, neighbouring pictures together, no two readers of one name; and what cannot be
@@ -515,7 +549,7 @@ def find_sources(
     place = _placing()
     for name in dict.fromkeys(_local(os.fspath(name)) for name in names):
         if re.match(r"[a-z][a-z0-9+.-]+://", name, re.IGNORECASE):
-            add(functools.partial(_open_url, name, clip), name)
+            add(functools.partial(_read_url, name, clip, unopened=unopened), name)
         elif name == "-" or (name == "stdin" and not Path(name).exists()):
             add(functools.partial(VideoReader, "-", clip), "stdin")
         elif name.isdecimal() and not Path(name).exists():
@@ -572,14 +606,21 @@ def _local(name: str) -> str:
     return urllib.request.url2pathname(parts.path) if parts and parts.netloc in {"", "localhost"} else name
 
 
-def _open_url(url: str, clip: Clip | None) -> FrameReader:
-    """Return a reader of a file behind an HTTP or FTP URL, which has an end, or of a live stream."""
-    if re.match("https?:|ftp:", url, re.IGNORECASE):
-        with _open_container(url, _without_secrets(url), timeout=_PATIENCE) as container:
-            # A file has a length in seconds or in bytes; that in bytes of a playlist, which may grow, is its own.
-            if container.duration or (container.size > 0 and container.format.name not in _PLAYLISTS):
-                return VideoReader(url, clip, timeout=_PATIENCE)
-    return StreamReader(url, clip)
+def _read_url(url: str, clip: Clip | None, *, unopened: bool) -> FrameReader:
+    """Return a reader of a file behind an HTTP or FTP URL, or of a live stream; ``unopened``, of what may be either."""
+    if not re.match("https?:|ftp:", url, re.IGNORECASE):
+        return StreamReader(url, clip)
+    if unopened:
+        return _UrlReader(url, clip)
+    with _open_container(url, _without_secrets(url), timeout=_PATIENCE) as container:
+        ends = _has_end(container)
+    return VideoReader(url, clip, timeout=_PATIENCE) if ends else StreamReader(url, clip)
+
+
+def _has_end(container: Any) -> bool:
+    """Return whether what is behind a URL is a file, which has a length in seconds or in bytes."""
+    # That in bytes of a playlist, which may grow, is its own.
+    return bool(container.duration or (container.size > 0 and container.format.name not in _PLAYLISTS))
 
 
 def _without_secrets(url: str) -> str:
@@ -632,7 +673,7 @@ def _is_file(path: Path) -> bool:
 
 
 @contextlib.contextmanager
-def _silent_opencv() -> Iterator[None]:
+def silent_opencv() -> Iterator[None]:
     """Keep OpenCV from printing: what it has to say is raised."""
     # OpenCV 4 has it by the first name, OpenCV 5 by the second.
     set_level: Callable[[int], int] = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel

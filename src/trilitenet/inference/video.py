@@ -41,6 +41,10 @@ _BATCHES_AHEAD: Final = 2
 """Batches that may wait between two stages of a stream."""
 _FRAMES_AHEAD: Final = 8
 """Frames that may wait for the encoder."""
+_LONGEST_SIDE: Final = 16384
+"""Pixels of a side that x264 takes."""
+_LONGEST_GAP: Final = 1000
+"""Seconds between two frames of a written video: MP4 has no room for distances of several hours."""
 
 
 class Prefetch(Generic[T]):
@@ -223,8 +227,9 @@ def _perceive_batch(batch: Sequence[Frame | Failure], predictor: Predictor) -> I
 class VideoWriter:
     """Writes an H.264 video that every browser plays (yuv420p, index at the front), encoding in a thread of its own.
 
-    The file gets its name when it is whole; until then it ends in ``.part``. Frames keep their time stamps, so a
-    variable frame rate stays one. Odd sides are made even by repeating the last row or column.
+    The file gets its name when it is whole; until then it ends in ``.part``. It begins with the first frame, from whose
+    time stamp the others keep their distances, of up to 1000 seconds, so a variable frame rate stays one. Odd sides are
+    made even by repeating the last row or column.
 
     Args:
         path: The ``.mp4`` file.
@@ -258,6 +263,7 @@ class VideoWriter:
         self._size: tuple[int, int] | None = None
         self._container: Any = None
         self._stream: Any = None
+        self._first: float | None = None
         self._last = -1
         self._waiting: queue.Queue[tuple[NDArray[np.uint8], float] | None] = queue.Queue(_FRAMES_AHEAD)
         self._error: OutputError | None = None
@@ -271,17 +277,21 @@ class VideoWriter:
         Args:
             image: (height, width, 3) uint8 RGB, or what else `to_rgb` takes; brought to the size of the first frame if
                 it differs.
-            timestamp: Seconds from the start; by the frame rate if left out.
+            timestamp: Seconds, from whenever; by the frame rate if left out.
 
         Raises:
-            ShapeError: If it is no such image, which takes nothing from the video.
+            ShapeError: If it is no such image, or larger than H.264 takes, which takes nothing from the video.
             OutputError: If the file cannot be written, at this frame or a later one; or if the writer was closed.
         """
         if self._error is not None:
             raise self._error
         if self._closed:
             raise OutputError(f"{self.path}: the video was closed")
-        self._waiting.put((to_rgb(image), self.frames / self._rate if timestamp is None else timestamp))
+        image = to_rgb(image)
+        height, width = image.shape[:2]
+        if not self.frames and max(height, width) > _LONGEST_SIDE:  # others are brought to the size of the first
+            raise ShapeError(f"H.264 takes at most {_LONGEST_SIDE} pixels a side, got {width} x {height}")
+        self._waiting.put((image, self.frames / self._rate if timestamp is None else timestamp))
         self.frames += 1
 
     def close(self) -> None:
@@ -339,7 +349,11 @@ class VideoWriter:
         # OpenCV's conversion (BT.601, 16 .. 235, as the stream says) is several times quicker than swscale's.
         planes = cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420)
         frame = self._av.VideoFrame.from_ndarray(planes, format="yuv420p")
-        self._last = max(self._last + 1, round(timestamp * _CLOCK))
+        if self._first is None:
+            self._first = timestamp
+        gap = timestamp - self._first - self._last / _CLOCK
+        self._first += max(0.0, gap - _LONGEST_GAP)
+        self._last = max(self._last + 1, round((timestamp - self._first) * _CLOCK))
         frame.pts, frame.time_base = self._last, Fraction(1, _CLOCK)
         self._mux(frame)
 
@@ -348,7 +362,7 @@ class VideoWriter:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._claimed.callback(Claim(self.path).close)
         self._container = self._av.open(str(part_of(self.path)), "w", format="mp4", options={"movflags": "+faststart"})
-        rate = Fraction(self._rate).limit_denominator(1001)
+        rate = max(Fraction(self._rate).limit_denominator(1001), Fraction(1, _LONGEST_GAP))
         self._stream = self._container.add_stream("libx264", rate=rate, options=self._options)
         self._stream.width, self._stream.height = width + width % 2, height + height % 2
         self._stream.pix_fmt = "yuv420p"

@@ -85,6 +85,20 @@ def test_frames_of_a_video_are_named_and_tracked(tmp_path: Path, video: list[Per
     assert len({annotation["id"] for annotation in document["annotations"]}) == len(document["annotations"])
 
 
+def test_videos_are_listed_and_their_tracks_told_apart(
+    tmp_path: Path, pictures: list[Perception], video: list[Perception]
+) -> None:
+    other = [dataclasses.replace(frame, source="night/drive.mp4") for frame in video]
+    document = json.loads(write(tmp_path, [*video, pictures[0], *other]).read_text(encoding="utf-8"))
+    assert document["videos"] == [{"id": 1, "name": "drive"}, {"id": 2, "name": "drive-2"}]
+    places = [(image.get("video_id"), image.get("frame_id")) for image in document["images"]]
+    assert places == [*((1, i) for i in range(4)), (None, None), *((2, i) for i in range(4))]
+    of = {image["id"]: image.get("video_id") for image in document["images"]}
+    tracks = {(of[each["image_id"]], each["track_id"]) for each in document["annotations"] if "track_id" in each}
+    assert tracks == {(1, 7), (2, 8)}
+    assert "videos" not in json.loads(write(tmp_path / "pictures", pictures).read_text(encoding="utf-8"))
+
+
 @pytest.mark.parametrize("kept", ["boxes", "drivable", "lane"])
 def test_what_was_not_looked_for_has_no_category(tmp_path: Path, pictures: list[Perception], kept: str) -> None:
     others: dict[str, Any] = {field: None for field in ("boxes", "drivable", "lane") if field != kept}

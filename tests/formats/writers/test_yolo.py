@@ -76,3 +76,22 @@ def test_the_confidence_is_written_only_where_it_is_asked_for(tmp_path: Path, pi
             writer.write(pictures[0])
         lines = (tmp_path / name / "labels" / "road.txt").read_text().splitlines()
         assert {len(line.split()) for line in lines} == {columns}
+
+
+def test_what_an_earlier_run_left_of_a_video_goes_once_it_is_done(tmp_path: Path, video: list[Perception]) -> None:
+    labels = tmp_path / "labels"
+    labels.mkdir()
+    mine = {"drive.txt", "drive-000009.txt", "drive-x-0000009.txt", "other-0000009.txt", "drive-0000009.csv"}
+    left = {"drive-0000003.txt", "drive-0000009.txt", "drive-12345678.txt"}
+    for name in mine | left:
+        (labels / name).touch()
+    with YoloWriter(tmp_path, overwrite=True) as writer:
+        writer.write(dataclasses.replace(video[0], boxes=None))
+        writer.remove_remains("drive.mp4")  # boxes were not looked for
+        for frame in video[:2]:
+            writer.write(frame)
+        assert {path.name for path in labels.iterdir()} == {"drive-0000000.txt", "drive-0000001.txt"} | mine | left
+        writer.write(video[3])
+        writer.remove_remains("drive.mp4")
+    written = {f"drive-000000{index}.txt" for index in (0, 1, 3)}
+    assert {path.name for path in labels.iterdir()} == written | mine

@@ -109,6 +109,16 @@ class Writer(abc.ABC):
                 self._broken = not isinstance(error, OutputError)
                 raise
 
+    def remove_remains(self, source: str) -> None:  # noqa: B027 - a new file replaces the old one whole
+        """Remove what an earlier run left of a video among its results, now that it is done to its end.
+
+        Args:
+            source: The video, as its perceptions name it.
+
+        Raises:
+            OutputError: If a file cannot be removed.
+        """
+
     def close(self) -> None:
         """Finish every file, but none that a failed write may have left with a gap; a writer can be closed twice.
 

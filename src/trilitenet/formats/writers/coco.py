@@ -20,8 +20,9 @@ class CocoWriter(Writer):
     """Writes ``coco.json``.
 
     The classes have the category ids 1, 2, ...; after them come ``drivable`` and ``lane``, whose annotations are one
-    run-length mask an image. A task that no perception has, has no categories: it was not looked for. The list of
-    images is held until the end: about 300 bytes a frame.
+    run-length mask an image. A task that no perception has, has no categories: it was not looked for. Tracks are
+    numbered over all videos of the file, those of the first as they are. The list of images is held until the end:
+    about 400 bytes a frame, 300 a picture.
     """
 
     FILES = ("coco.json",)
@@ -31,6 +32,10 @@ class CocoWriter(Writer):
         head = f'{{"info": {dumps({"description": "Written by trilitenet", "version": "1.0"})},\n"annotations": ['
         self._stream: JsonStream | None = JsonStream(self.create("coco.json"), head)
         self._images: list[dict[str, Any]] = []
+        self._videos: dict[str | None, tuple[int, str]] = {}
+        self._tracks: dict[tuple[int, int], int] = {}
+        self._track_ids: set[int] = set()
+        self._highest = 0
         self._class_names: tuple[str, ...] = ()
         self._tasks: set[str] = set()
         self._annotations = 0
@@ -40,7 +45,13 @@ class CocoWriter(Writer):
         height, width = perception.size
         self._class_names = perception.class_names
         image_id = len(self._images) + 1
-        image = {"id": image_id, "file_name": self.image_name(perception), "width": width, "height": height}
+        name = self.image_name(perception)
+        image: dict[str, Any] = {"id": image_id, "file_name": name, "width": width, "height": height}
+        video = 0
+        if perception.frame is not None:
+            named = len(self._videos) + 1, name.rpartition("-")[0]
+            video, _ = self._videos.setdefault(perception.source, named)
+            image |= {"video_id": video, "frame_id": perception.frame}
         self._images.append(image)
         masks = {"drivable": perception.drivable, "lane": perception.lane}
         results = {"detection": perception.boxes, **masks}
@@ -56,7 +67,7 @@ class CocoWriter(Writer):
                 "score": round(found.confidence, 4),
             }
             if found.track_id >= 0:
-                annotation["track_id"] = found.track_id
+                annotation["track_id"] = self._track(video, found.track_id)
             self._add(image_id, annotation)
         for place, mask in enumerate(masks.values(), start=1):
             if mask is None or not mask.any():
@@ -85,9 +96,20 @@ class CocoWriter(Writer):
             if task in self._tasks
         ]
         images = ",\n".join(dumps(image) for image in self._images)
-        self._stream.close(f'],\n"images": [\n{images}\n],\n"categories": {dumps(numbered)}}}')
+        videos = [{"id": number, "name": name} for number, name in self._videos.values()]
+        listed = f'"videos": {dumps(videos)},\n' if videos else ""
+        self._stream.close(f'],\n{listed}"images": [\n{images}\n],\n"categories": {dumps(numbered)}}}')
         self.finish(self._stream.path)
         self._stream = None
+
+    def _track(self, video: int, track_id: int) -> int:
+        """Return a number that no other video's track has, its own if that is free; all pictures are the video 0."""
+        if (video, track_id) not in self._tracks:
+            number = self._highest + 1 if track_id in self._track_ids else track_id
+            self._tracks[video, track_id] = number
+            self._track_ids.add(number)
+            self._highest = max(self._highest, number)
+        return self._tracks[video, track_id]
 
     def _add(self, image_id: int, annotation: dict[str, Any]) -> None:
         assert self._stream is not None

@@ -5,6 +5,8 @@ Format: https://docs.ultralytics.com/datasets/detect/. Only boxes have a place i
 
 from __future__ import annotations
 
+import re
+from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from trilitenet.errors import writing
 from trilitenet.formats.writers.base import Writer
 from trilitenet.processing.boxes import xyxy_to_cxcywh
 from trilitenet.structures import Perception
@@ -37,6 +40,11 @@ class YoloWriter(Writer):
         super().__init__(output, overwrite=overwrite)
         self.confidence = confidence
         self._class_names: tuple[str, ...] | None = None
+        self._remains: dict[str, set[Path]] = defaultdict(set)
+        if overwrite:
+            for path in (output / "labels").glob("*.txt"):
+                if video := _video_of(path):
+                    self._remains[video].add(path)
         self._data = self.create("data.yaml")
 
     def _write(self, perception: Perception, road: Mapping[str, Any] | None = None) -> None:
@@ -52,7 +60,16 @@ class YoloWriter(Writer):
             values = " ".join(f"{value:.6f}" for value in box)
             lines.append(f"{class_id} {values}" + (f" {score:.4f}" if self.confidence else "") + "\n")
         self.write_whole(path, "".join(lines))
+        if video := _video_of(path):
+            self._remains[video].discard(path)
         self._class_names = perception.class_names
+
+    def remove_remains(self, source: str) -> None:
+        """Remove the labels that an earlier run left of other frames of a video, if this one looked for boxes."""
+        if self._class_names is not None:
+            for path in self._remains.pop(self.stem(source), ()):
+                with writing(path):
+                    path.unlink(missing_ok=True)
 
     def _close(self) -> None:
         """Write ``data.yaml``."""
@@ -61,3 +78,9 @@ class YoloWriter(Writer):
         data = {"train": "images", "val": "images", "names": list(self._class_names)}  # from its own folder on
         self._class_names = None
         self.write_whole(self._data, yaml.safe_dump(data, sort_keys=False))
+
+
+def _video_of(labels: Path) -> str | None:
+    """Return the stem of the video of which a label file, by its name, has a frame."""
+    frame = re.fullmatch(r"(.+)-\d{7,}", labels.stem)
+    return None if frame is None else frame[1]
