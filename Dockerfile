@@ -15,7 +15,7 @@ ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 WORKDIR /build
 RUN python -m venv /opt/trilitenet \
     && /opt/trilitenet/bin/pip install "${TORCH}" --index-url "${TORCH_INDEX}"
-COPY pyproject.toml README.md LICENSE ./
+COPY pyproject.toml README.md LICENSE LICENSE-WEIGHTS ./
 COPY src src
 RUN /opt/trilitenet/bin/pip install ".[${EXTRAS}]"
 

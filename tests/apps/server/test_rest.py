@@ -294,6 +294,19 @@ def test_one_image_goes_the_whole_way_before_the_service_is_ready(client: TestCl
     assert "trilitenet_ready 1.0" in text
 
 
+def test_what_alerts_look_at_begins_with_0(client: TestClient, jpeg: bytes, backend: FakeBackend) -> None:
+    text = client.get("/metrics").text
+    for route in ("/v1/predict", "/v1/predict/batch", "/v2/models/{model}/infer"):
+        assert f'trilitenet_requests_total{{method="POST",route="{route}",status="500"}} 0.0' in text
+    for reason in ("queue_full", "deadline", "internal"):
+        assert f'trilitenet_rejects_total{{reason="{reason}"}} 0.0' in text
+    backend.error = RuntimeError("secret detail")
+    client.post("/v1/predict", content=jpeg)
+    text = client.get("/metrics").text
+    assert 'trilitenet_requests_total{method="POST",route="/v1/predict",status="500"} 1.0' in text
+    assert 'trilitenet_rejects_total{reason="internal"} 1.0' in text
+
+
 def test_metrics_count_what_happened(client: TestClient, jpeg: bytes) -> None:
     client.post("/v1/predict", content=jpeg)
     client.post("/v1/predict", content=b"no image")

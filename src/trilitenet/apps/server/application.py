@@ -10,6 +10,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
+from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 from trilitenet import __version__
@@ -91,9 +92,10 @@ def _routes(service: Service) -> FastAPI:
         lifespan=lifespan,
     )
     api.token = service.settings.token is not None
-    api.include_router(rest_router(service))
-    api.include_router(protocol_router(service))
-    api.include_router(pages_router())
+    for router in (rest_router(service), protocol_router(service), pages_router()):
+        api.include_router(router)
+        routes = (route for route in router.routes if isinstance(route, Route))
+        service.metrics.expect(route.path for route in routes if "POST" in (route.methods or ()))
     api.add_exception_handler(ProblemError, _on_problem)
     api.add_exception_handler(RequestValidationError, _on_invalid)
     api.add_exception_handler(HTTPException, _on_http)

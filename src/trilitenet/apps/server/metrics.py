@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Final
 
 from prometheus_client import (
@@ -20,6 +20,9 @@ __all__ = ["STAGES", "Metrics"]
 
 STAGES: Final = ("upload", "decode", "preprocess", "queue", "network", "postprocess", "encode")
 """The stages of a request, in their order; each has a latency histogram."""
+
+BUSY: Final = ("queue_full", "queue_slow", "deadline", "memory", "too_many_connections", "closing", "internal")
+"""Reasons of refusals that are the service's, not the client's."""
 
 _SECONDS: Final = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 25.0, 50.0, 100.0)
 
@@ -65,6 +68,14 @@ class Metrics:
             registry=self.registry,
         )
         self._info = Info("trilitenet_model", "The model that is served.", registry=self.registry)
+
+    def expect(self, routes: Iterable[str]) -> None:
+        """Begin with 0 what alerts look at, for routes that are posted to: no rise is seen in what begins with 1."""
+        for route in routes:
+            for status in ("500", "503"):
+                self._answers.labels(route, "POST", status)
+        for reason in BUSY:
+            self._rejects.labels(reason)
 
     def gauge(self, name: str, text: str, value: Callable[[], float]) -> None:
         """Add a gauge that is read when it is scraped."""
