@@ -67,3 +67,30 @@ def test_a_perception_of_other_things_is_refused(field: str, value: Any, got: st
     with pytest.raises(ShapeError, match=f"{field} {got}"):
         Perception((1, 2), **{field: value})
     Perception([1, 2], drivable=np.zeros((1, 2), bool))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["class_id", "track_id"])
+@pytest.mark.parametrize(
+    "value", [np.array([0.7]), np.array([-0.5]), np.array([np.nan]), np.array([2**63 + 5], np.uint64)]
+)
+def test_numbers_that_would_become_others_are_refused(name: str, value: Any) -> None:
+    arrays = {"class_id": [0], name: value}
+    with pytest.raises(ShapeError, match=f"{name} must be whole numbers"):
+        Boxes(np.zeros((1, 4)), np.ones(1), **arrays)  # type: ignore[arg-type]
+    assert Boxes(np.zeros((1, 4)), np.ones(1), np.array([2.0])).class_id.tolist() == [2]  # type: ignore[arg-type]
+
+
+def test_boxes_of_nothing_are_refused() -> None:
+    with pytest.raises(ShapeError, match="xyxy must be an array of float32, got None"):
+        Boxes(None, np.ones(1), np.zeros(1, np.int64))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("size", ["ab", (1, 2, 3), None, (-1, 2), (1.0, 2.0)])
+def test_a_size_is_two_whole_numbers(size: Any) -> None:
+    with pytest.raises(ShapeError, match="size must be"):
+        Perception(size)
+
+
+def test_a_text_is_no_list_of_names() -> None:
+    with pytest.raises(ShapeError, match=r"write \('vehicle',\)"):
+        Perception((2, 2), class_names="vehicle")  # type: ignore[arg-type]

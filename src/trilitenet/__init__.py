@@ -55,13 +55,15 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name in _PUBLIC:
-        with needing_torch():
-            value = getattr(importlib.import_module(_PUBLIC[name]), name)
-        globals()[name] = value
-        return value
-    raise AttributeError(f"module 'trilitenet' has no attribute {name!r}")
+if not TYPE_CHECKING:  # or a misspelt name would be Any to type checkers
+
+    def __getattr__(name: str) -> Any:
+        if name in _PUBLIC:
+            with needing_torch():
+                value = getattr(importlib.import_module(_PUBLIC[name]), name)
+            globals()[name] = value
+            return value
+        raise AttributeError(f"module 'trilitenet' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

@@ -558,5 +558,5 @@ def _explain(cls: type[Any], error: ValidationError) -> str:
     if first["type"] == "value_error":  # raised by a dataclass itself; the input is all of its fields
         return f"{where}{first['ctx']['error']}"
     given = first.get("input")
-    quotes = first["type"] == "string_type" and not isinstance(given, (list, dict, type(None)))  # YAML's off is false
+    quotes = first["type"] == "string_type" and isinstance(given, (bool, int, float))  # YAML's off is false
     return f"{where}{first['msg']}, got {shown(given)}{'; put it into quotes' if quotes else ''}"

@@ -24,7 +24,30 @@ def _told(value: object) -> str:
     return f"{value.shape} {value.dtype}" if isinstance(value, np.ndarray) else f"no array but a {type(value).__name__}"
 
 
-_BOX_ARRAYS: Final = {"xyxy": np.float32, "confidence": np.float32, "class_id": np.int64, "track_id": np.int64}
+def _as_array(name: str, value: object, dtype: type[np.generic]) -> NDArray[Any]:
+    """Return an array of a type.
+
+    Raises:
+        ShapeError: If it cannot be one, or whole numbers would become others by it.
+    """
+    try:
+        with np.errstate(invalid="ignore"):  # told below
+            array = np.asarray(value, dtype)
+    except (OverflowError, TypeError, ValueError) as error:
+        raise ShapeError(f"{name} must be an array of {dtype.__name__} ({error})") from error
+    if array.dtype.kind == "i" and getattr(value, "dtype", None) != array.dtype:
+        given = np.asarray(value)
+        if given.dtype.kind in "fu" and not (given == array).all():
+            raise ShapeError(f"{name} must be whole numbers of {dtype.__name__}")
+    return array
+
+
+_BOX_ARRAYS: Final[dict[str, type[np.generic]]] = {
+    "xyxy": np.float32,
+    "confidence": np.float32,
+    "class_id": np.int64,
+    "track_id": np.int64,
+}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -50,10 +73,9 @@ class Boxes:
         for name, dtype in _BOX_ARRAYS.items():
             value = getattr(self, name)
             if value is not None:
-                try:
-                    object.__setattr__(self, name, np.asarray(value, dtype))
-                except (OverflowError, TypeError, ValueError) as error:
-                    raise ShapeError(f"{name} must be an array of {dtype.__name__} ({error})") from error
+                object.__setattr__(self, name, _as_array(name, value, dtype))
+            elif name != "track_id":
+                raise ShapeError(f"{name} must be an array of {dtype.__name__}, got None")
         count = len(self.xyxy) if self.xyxy.ndim else 0
         if self.xyxy.shape != (count, 4):
             raise ShapeError(f"xyxy must be (N, 4), got {self.xyxy.shape}")
@@ -136,6 +158,12 @@ class Perception:
     timestamp: float | None = None
 
     def __post_init__(self) -> None:
+        size, names = self.size, self.class_names
+        whole = isinstance(size, (tuple, list)) and all(isinstance(side, (int, np.integer)) for side in size)
+        if not (whole and len(size) == 2 and min(size) >= 0):
+            raise ShapeError(f"size must be (height, width) in pixels, got {size!r}")
+        if isinstance(names, str):
+            raise ShapeError(f"class_names must be several names, got the text {names!r}; write ({names!r},)")
         for name in ("drivable", "lane"):
             mask = getattr(self, name)
             if mask is not None and not (
