@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 import time
@@ -84,6 +85,21 @@ def test_the_table_tells_the_input_of_each_model(monkeypatch: pytest.MonkeyPatch
     assert [row.split(" | ")[3] for row in rows] == ["64x32", "128x64", "160x96"]
 
 
+@pytest.mark.parametrize(
+    ("size", "inputs"), [(None, ["96x64", "224x128", "64x32"]), ((96, 160), ["160x96"] * 2 + ["64x32"])]
+)
+@pytest.mark.parametrize("stage", ["network", "frame"])
+def test_each_model_is_measured_at_the_size_it_was_trained_at_unless_another_is_asked_for(
+    size: tuple[int, int] | None, inputs: list[str], stage: Literal["network", "frame"], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backends = {"a": ColourBackend(), "b": ColourBackend(), "fixed.onnx": ColourBackend((32, 64))}
+    for backend, trained in zip(backends.values(), ((64, 96), (128, 224), (64, 96)), strict=True):
+        backend.card = dataclasses.replace(backend.card, input_size=trained)
+    monkeypatch.setattr("trilitenet.commands.benchmark.load", lambda model, **_: Predictor(backends[model]))
+    result = benchmark(*backends, stage=stage, rounds=1, warmup=0, size=size, source=(90, 160))
+    assert [f"{row.size[1]}x{row.size[0]}" for row in result.timings] == inputs
+
+
 def test_whole_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     backend, seen = ColourBackend(canvas=(64, 128)), []
     plain = Predictor.perceive
@@ -104,6 +120,7 @@ def test_cost_table() -> None:
     result = benchmark(table="cost", size=(64, 128))
     assert [cost.parameters for cost in result.costs] == [151_413, 592_338, 2_350_206]
     assert "| tiny | 0.151 | 0.022 | 128x64 |" in result.summary()
+    assert {cost.size for cost in benchmark(table="cost").costs} == {(384, 640)}
 
 
 def test_numbers_must_be_positive() -> None:

@@ -174,6 +174,13 @@ def test_a_conversion_without_images_or_labels_is_an_error(
     assert "two: no image was written" in shown.err
 
 
+@pytest.mark.parametrize("kind", ["bdd100k", "masks"])
+def test_what_missing_labels_mean_is_refused_where_files_tell_it(raw: Path, tmp_path: Path, kind: Any) -> None:
+    (tmp_path / "classes.yaml").write_text("missing: empty\n")
+    with pytest.raises(ConfigError, match=f"'missing' .* is for coco, yolo and cvat; leave it out for {kind}"):
+        convert(str(raw), tmp_path / "out", kind=kind, classes=tmp_path / "classes.yaml")
+
+
 def test_convert_wants_its_words(raw: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="unknown kind of data set 'kitti'"):
         convert("kitti", raw, tmp_path / "out")

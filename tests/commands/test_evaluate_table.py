@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 import shutil
@@ -16,6 +17,8 @@ from trilitenet.commands.evaluate_table import PrecisionRow, PrecisionTable, eva
 from trilitenet.data.synthetic_files import write_dataset
 from trilitenet.engine.report import read_report
 from trilitenet.errors import ConfigError, OutputError
+from trilitenet.models.trilitenet import build_network
+from trilitenet.models.weights import save_network
 
 
 def test_differences_are_to_the_first_row_of_the_model() -> None:
@@ -87,6 +90,21 @@ def test_int8_is_named_by_what_calibrates_it(tmp_path: Path, monkeypatch: pytest
     next((tmp_path / "copy" / "det_annotations" / "val").iterdir()).unlink()
     assert names(calibration=tmp_path / "copy") == first
     assert names(calibration=tmp_path / "copy", max_drop=1.0)[1] != dropped[1]
+
+
+def test_each_model_is_exported_at_the_size_it_was_trained_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_dataset(tmp_path / "data", "val", 1, 0, size=(64, 128))
+    network = build_network("tiny")
+    save_network(network, tmp_path / "own.safetensors", dataclasses.replace(network.card, input_size=(64, 96)))
+    exported: list[str] = []
+    report = SimpleNamespace(values=lambda: {"fair/lane/iou": 0.5}, provenance=SimpleNamespace(runtime="x"))
+    monkeypatch.setattr(command, "export", lambda *_, output, size, **__: exported.extend((output.name, size)))
+    monkeypatch.setattr(command, "evaluate", lambda *_, **__: report)
+    options: dict[str, Any] = {"data": tmp_path / "data", "output": tmp_path, "precisions": ("fp32",)}
+    evaluate_table(tmp_path / "own.safetensors", "tiny", **options)
+    names, sizes = exported[::2], exported[1::2]
+    assert sizes == ["64x96", "384x640"]
+    assert [name.split("-", 2)[2] for name in names] == ["64x96-fp32.xml", "384x640-fp32.xml"]
 
 
 @pytest.mark.slow

@@ -303,6 +303,23 @@ def test_an_artefact_is_compared_on_the_pictures_asked_for(
     assert kept == [Path("a"), Path("b"), None]
 
 
+@pytest.mark.parametrize(
+    ("options", "canvas"), [({}, (64, 96)), ({"size": "64x128"}, (64, 128)), ({"size": "dynamic"}, None)]
+)
+def test_the_input_is_as_large_as_in_training_unless_another_size_is_asked_for(
+    tmp_path: Path, options: dict[str, Any], canvas: tuple[int, int] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network = build_network("tiny")
+    save_network(network, tmp_path / "own.safetensors", dataclasses.replace(network.card, input_size=(64, 96)))
+    kept: list[object] = []
+    monkeypatch.setattr(command, "build_onnx", lambda *_, **__: None)
+    monkeypatch.setattr(
+        command, "_keep", lambda _network, _built, info, _path, checks: kept.extend((info.size, checks[0].shape))
+    )
+    export(tmp_path / "own.safetensors", output=tmp_path / "a.onnx", **options)
+    assert kept == [canvas, (*(canvas or (64, 96)), 3)]
+
+
 def test_an_artefact_is_compared_at_the_thresholds_of_its_model(monkeypatch: pytest.MonkeyPatch) -> None:
     network = build_network("tiny")
     network.card = dataclasses.replace(network.card, thresholds=Thresholds(confidence=0.2, drivable=0.4, lane=0.6))

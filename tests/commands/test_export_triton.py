@@ -47,7 +47,7 @@ def test_what_is_asked_of_a_graph_reaches_it(tmp_path: Path, monkeypatch: pytest
 
     monkeypatch.setattr(command, "export", build)
     plain: dict[str, Any] = {
-        "precision": "fp32", "size": "384x640", "calibration": None, "calibration_frames": 500, "max_drop": None,
+        "precision": "fp32", "size": None, "calibration": None, "calibration_frames": 500, "max_drop": None,
         "nms": False, "portable": False, "masks": None, "mask_scale": 1, "bgr": False, "layout": "auto", "frames": None,
         "network": None,
     }  # fmt: skip

@@ -150,7 +150,7 @@ def benchmark(
     table: Literal["latency", "cost"] = "latency",
     rounds: int = 50,
     warmup: int = 5,
-    size: tuple[int, int] = (384, 640),
+    size: tuple[int, int] | None = None,
     source: tuple[int, int] = (720, 1280),
     network: str | None = None,
     device: str = "auto",
@@ -170,7 +170,8 @@ def benchmark(
             them), nothing timed.
         rounds: Timed calls an entry; every round calls each entry once.
         warmup: Calls before.
-        size: Height and width of the network's input, where a model takes any; --stage frame takes the longer side.
+        size: Height and width of the network's input, where a model takes any; by default what each was trained at, and
+            384 640 for --table cost. --stage frame takes the longer side.
         source: Height and width of the image for --stage frame.
         network: The function that built the network of those weight files that are of one of your own:
             FILE.py:FUNCTION or MODULE:FUNCTION.
@@ -194,7 +195,8 @@ def benchmark(
     if min(rounds, *batch) < 1 or warmup < 0:
         raise ConfigError("--rounds and --batch must be at least 1, --warmup not negative")
     check_parallel(streams=streams, threads=threads)
-    check_size(size, "--size")
+    if size is not None:
+        check_size(size, "--size")
     if min(source) < 1:
         raise ConfigError(f"--source must be at least 1x1, got {source[0]}x{source[1]} (height x width)")
     if table == "cost" and (models or plot is not None):
@@ -252,13 +254,16 @@ class _Entry:
 class _Call:
     """What is timed."""
 
-    def __init__(self, entry: _Entry, batch: int, stage: str, size: tuple[int, int], source: tuple[int, int]) -> None:
+    def __init__(
+        self, entry: _Entry, batch: int, stage: str, size: tuple[int, int] | None, source: tuple[int, int]
+    ) -> None:
         self.entry, self.batch, self.stage = entry, batch, stage
         generator = np.random.default_rng(0)
         self.milliseconds: list[float] = []
         self.joules: float | None = None
         self.watts: float | None = None
         predictor = entry.predictor
+        size = size or predictor.card.input_size
         if stage == "network":
             self.size = predictor.backend.canvas or size
             images = generator.integers(0, 256, (batch, *self.size, 3), np.uint8)
@@ -341,7 +346,7 @@ def _machine(threads: int | None, streams: int) -> dict[str, str]:
     }
 
 
-def _costs(size: tuple[int, int], network: str | None) -> tuple[Cost, ...]:
+def _costs(size: tuple[int, int] | None, network: str | None) -> tuple[Cost, ...]:
     from trilitenet.models.builders import build_by
     from trilitenet.models.cost import count_multiply_adds, count_parameters
 
@@ -349,7 +354,8 @@ def _costs(size: tuple[int, int], network: str | None) -> tuple[Cost, ...]:
     for variant, builder in itertools.product(VARIANTS, (None,) if network is None else (None, network)):
         built = build_by(builder, variant, 1, TASKS)
         name = variant if builder is None else f"{variant}, {builder}"
-        costs.append(Cost(name, count_parameters(built), count_multiply_adds(built, size), size))
+        canvas = size or built.card.input_size
+        costs.append(Cost(name, count_parameters(built), count_multiply_adds(built, canvas), canvas))
     return tuple(costs)
 
 

@@ -434,6 +434,8 @@ def _arguments(source: str, output: StrPath, target: StrPath | None, kind: str |
 
 
 def _open_source(kind: str, raw: str, mapping: LabelMapping, options: ConversionOptions) -> RecordSource:
+    if mapping.missing is not None and kind in {"bdd100k", "masks"}:
+        raise ConfigError(f"'missing' in the file of --classes is for coco, yolo and cvat; leave it out for {kind}")
     if kind == "bdd100k":
         return read_bdd100k(raw, crosswalk=options.crosswalk, vertical=options.vertical)
     readers: dict[str, Callable[[str, LabelMapping], RecordSource]] = {

@@ -112,7 +112,7 @@ def evaluate_table(
     output: StrPath,
     precisions: Sequence[Precision] | None = None,
     format: Literal["openvino", "onnx"] = "openvino",
-    size: str = "384x640",
+    size: str | None = None,
     split: str = "val",
     calibration: StrPath | None = None,
     calibration_frames: int = 500,
@@ -133,7 +133,7 @@ def evaluate_table(
         precisions: fp32, fp16, bf16 (OpenVINO), int8; all of the format's if left out. The others are compared with
             the first.
         format: Runtime: openvino or onnx.
-        size: HEIGHTxWIDTH of the input, the same for all.
+        size: HEIGHTxWIDTH of the input of all models, or dynamic; the size that each was trained at if left out.
         split: Split to measure on.
         calibration: Frames for INT8: a data set's train split, or a folder of pictures; by default that of --data.
         calibration_frames: At most so many of them.
@@ -174,11 +174,12 @@ def evaluate_table(
     for model in [os.fspath(model) for model in models or VARIANTS]:
         card = read_card(model)
         classes = card.class_names
+        canvas = "x".join(map(str, card.input_size)) if size is None else size
         if classes not in hashes:
             hashes[classes] = hash_dataset(DrivingDataset(data, split, class_names=classes), limit)
         stamp = (hash_model(model) or "")[:12]
         for precision in precisions:
-            name = f"{Path(model).stem}-{stamp}-{size}-{precision}{int8 if precision == 'int8' else ''}"
+            name = f"{Path(model).stem}-{stamp}-{canvas}-{precision}{int8 if precision == 'int8' else ''}"
             artefact = output / f"{name}{ARTEFACT_SUFFIXES[format]}"
             folder = output / (name if format == "openvino" else f"{name}-{format}")
             files = [artefact, *([artefact.with_suffix(".bin")] if format == "openvino" else [])]
@@ -193,7 +194,7 @@ def evaluate_table(
                     card=card,
                     protocols=("paper", "fair"),
                     backend=runtime,
-                    long_side=None if size == "dynamic" else max(map(int, size.split("x"))),
+                    long_side=None if canvas == "dynamic" else max(map(int, canvas.split("x"))),
                 )
             if report is None:
                 stage = f"{model} {precision} ({len(rows) + 1} of {len(models or VARIANTS) * len(precisions)})"
@@ -204,7 +205,7 @@ def evaluate_table(
                         format=format,
                         output=artefact,
                         precision=precision,
-                        size=size,
+                        size=canvas,
                         calibration=calibration if precision == "int8" else None,
                         calibration_frames=calibration_frames,
                         max_drop=max_drop if precision == "int8" else None,

@@ -60,7 +60,7 @@ from trilitenet.inference.exported import prepare_input
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.torch_backend import TorchBackend
 from trilitenet.models.trilitenet import NetworkOutputs, TriLiteNet
-from trilitenet.models.weights import load_network
+from trilitenet.models.weights import load_network, read_card
 from trilitenet.processing.images import read_image
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.structures import RawOutputs
@@ -133,7 +133,7 @@ def export(
     format: Format = "onnx",
     output: StrPath | None = None,
     precision: Precision = "fp32",
-    size: str = "384x640",
+    size: str | None = None,
     calibration: StrPath | None = None,
     calibration_frames: int = 500,
     max_drop: float | None = None,
@@ -159,7 +159,8 @@ def export(
         output: File to write (for triton, the folder of the repository); by default named after the model, here.
         precision: fp32, fp16 (weights stored so; on Arm, NCNN computes so too), bf16 (OpenVINO) or int8 (needs
             --calibration).
-        size: HEIGHTxWIDTH of the input in multiples of 32, or dynamic (not with ncnn, executorch or tensorrt).
+        size: HEIGHTxWIDTH of the input in multiples of 32, or dynamic (not with ncnn, executorch or tensorrt); the size
+            that the model was trained at if left out.
         calibration: Frames for INT8: a data set in the published layout (its train split) or a folder of pictures.
         calibration_frames: At most so many of them.
         max_drop: INT8 may lose at most so many points of a score on the val split of --calibration; layers fall back
@@ -186,7 +187,7 @@ def export(
     """
     model, output, calibration, frames = os.fspath(model), *map(optional_path, (output, calibration, frames))
     portable = portable or format in _PORTABLE
-    parsed = _parse_size(size)
+    parsed = read_card(model).input_size if size is None else _parse_size(size)
     _check_options(
         format, precision, parsed, calibration, calibration_frames, max_drop, nms, portable, masks, mask_scale, layout
     )

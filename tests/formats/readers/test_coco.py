@@ -264,6 +264,23 @@ def test_an_image_with_a_broken_annotation_is_left_out_and_named(
     assert f"labels.json: image 'two.png', annotation 17: {message}" in caplog.text
 
 
+def test_images_without_annotations_are_told_and_may_be_left_unlabelled(tmp_path: Path) -> None:
+    names = ("one", "boxes", "none", "broken")
+    images = [{**coco()["images"][0], "id": 7 + index, "file_name": f"{name}.png"} for index, name in enumerate(names)]
+    for name in names:
+        write(tmp_path / f"{name}.png")
+    more = [{"image_id": 8, "category_id": 1, "bbox": [1, 2, 3, 4]}, {"image_id": 10, "category_id": 1}]
+    write(tmp_path / "labels.json", coco(images=images, annotations=[*coco()["annotations"], *more]))
+    source = read_coco(tmp_path, LabelMapping(drivable=("road",)))
+    assert source.found[1].startswith("train: 1 images without any label are taken as looked at, with nothing there; ")
+    assert (source.record("train", "none").objects, source.record("train", "none").drivable) == ((), ())
+    assert len(read_coco(tmp_path, LabelMapping(drivable=("road",), missing="empty")).found) == 1
+    source = read_coco(tmp_path, LabelMapping(drivable=("road",), missing="unlabelled"))
+    assert len(source.found) == 1
+    assert convert(source, tmp_path / "out").labelled == {"train": {"detection": 2, "drivable": 1}}
+    assert DrivingDataset(tmp_path / "out", "train").names == ["boxes", "none", "one"]
+
+
 def test_areas_of_too_few_points_are_counted(tmp_path: Path) -> None:
     write(tmp_path / "one.png")
     area = {"image_id": 7, "category_id": 2, "segmentation": [[], [1, 2], [1, 2, 3, 4], [1, 1, 9, 1, 9, 9]]}

@@ -3,12 +3,14 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
 import pytest
 
 from tests.formats.readers.conftest import CLASSES, SIZE, check_round_trip
+from trilitenet.config import TASKS
 from trilitenet.data.converting import ConversionOptions, convert
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.records import ImageRecord, ObjectLabel
@@ -162,6 +164,32 @@ def test_labels_that_all_mean_nothing_are_refused(tmp_path: Path) -> None:
         read_shapes(tmp_path, box.format("Car"), LabelMapping())
     assert read_shapes(tmp_path, box.format("Car") + box.format("car"), LabelMapping()).objects
     assert read_shapes(tmp_path, "", LabelMapping()).objects is None
+
+
+@pytest.mark.parametrize("missing", [None, "empty", "unlabelled"])
+def test_images_that_nobody_has_labelled(tmp_path: Path, missing: Literal["empty", "unlabelled"] | None) -> None:
+    box, area = '<box label="{}" xtl="1" ytl="2" xbr="9" ybr="7"/>', '<polygon label="{}" points="1,2;30,2;30,40"/>'
+    shapes = {
+        "all": box.format("car") + area.format("drivable") + '<polyline label="lane" points="50,5;50,45"/>',
+        "boxes": box.format("car"),
+        "areas": area.format("drivable"),
+        "others": box.format("tree") + area.format("mud"),
+        "none": '<tag label="scene"/>',
+    }
+    images = [f'<image name="{name}.png" width="80" height="48">{text}</image>' for name, text in shapes.items()]
+    (tmp_path / "annotations.xml").write_text(f"<annotations>{''.join(images)}</annotations>")
+    for name in shapes:
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((*SIZE, 3), np.uint8))
+    source = read_cvat(tmp_path, LabelMapping(ignore=("mud",), missing=missing))
+    told = "train: 1 images without any label are taken as looked at, with nothing there; 'missing: unlabelled'"
+    assert [line.startswith(told) for line in source.found[1:]] == ([True] if missing is None else [])
+    report = convert(source, tmp_path / "out")
+    counts = (2, 2, 1) if missing == "unlabelled" else (5, 5, 5)
+    assert report.labelled == {"train": dict(zip(TASKS, counts, strict=True))}
+    sample = DrivingDataset(tmp_path / "out", "train")[2]
+    assert sample.name == "boxes"
+    assert sample.boxes is not None
+    assert (sample.drivable is None) == (sample.lane is None) == (missing == "unlabelled")
 
 
 def test_images_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:

@@ -61,6 +61,9 @@ def test_polygons_confidences_and_missing_files(root: Path, tmp_path: Path) -> N
     assert DrivingDataset(tmp_path / "out", "val")[0].boxes is None
     empty = read_yolo(root, LabelMapping(classes={"car": ("car",)}, missing="empty")).record("val", "a")
     assert empty.objects == ()
+    (root / "labels/val/a.txt").write_text("")  # looked at, whatever a missing file means
+    told = read_yolo(root, LabelMapping(classes={"car": ("car",)}, missing="unlabelled")).record("val", "a")
+    assert told.objects == ()
 
 
 @pytest.mark.parametrize(

@@ -62,6 +62,7 @@ def read_coco(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
     if not any(records.values()):
         raise DataError(f"{root}: none of the images of its annotation files is there")
     mapping.check_categories(categories, root)
+    found += mapping.tell_empty(records)
     if unused:
         found.append(f"not used: {few([path.name for path in unused], most=10)}")
     splits = {split: named_apart(items) for split, items in records.items() if items}
@@ -158,7 +159,7 @@ def _read_file(
                 records.append(BrokenRecord(place.stem, place, reason=reason))
                 continue
             own.attributes = {str(key): str(value) for key, value in (image.get("attributes") or {}).items()}
-            records.append(own.record(place.stem, place, tasks, size))
+            records.append(own.record(place.stem, place, mapping.labelled_in(own, tasks), size))
     except DataError:
         raise
     except (LookupError, TypeError, ValueError, OverflowError, AttributeError) as error:

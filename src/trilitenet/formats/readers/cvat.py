@@ -77,6 +77,7 @@ def read_cvat(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
         raise DataError(f"{root}: none of the images that the .xml lists is there; put them beside it or in images/")
     mapping.check_categories(categories, root)
     found = [f"{split}: {len(items)} images" for split, items in records.items()]
+    found += mapping.tell_empty(records)
     if missing:
         found.append(f"{missing} listed images are not there")
     if videos:
@@ -126,7 +127,7 @@ def _read_file(
             what = str(error) if isinstance(error, DataError) else f"not as CVAT has it ({brief(error)})"
             records[split].append(BrokenRecord(place.stem, place, reason=f"{path}: image {name!r}, {what}"))
             continue
-        records[split].append(labels.record(place.stem, place, tasks, size))
+        records[split].append(labels.record(place.stem, place, mapping.labelled_in(labels, tasks), size))
     return missing
 
 

@@ -7,7 +7,7 @@ import dataclasses
 import itertools
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -80,7 +80,9 @@ class LabelMapping:
         lane: Categories of lane markings.
         lane_edges: Lines come two a marking, its edges; they are paired. False: a line is a marking's middle.
         tasks: What is labelled; found from the categories if left out.
-        missing: An image without a label file is ``unlabelled``, or ``empty``: looked at, and nothing there.
+        missing: An image without labels is ``unlabelled``, or ``empty``: looked at, and nothing there. For YOLO this is
+            one without a label file, unlabelled if left out; for COCO and CVAT one that has no label of a task, which
+            goes for each task on its own, empty if left out. Other formats do not take it.
         split: The split of images that the format does not put into one.
         splits: ``--from masks``: the splits to look for.
         images: ``--from masks``: folder of the images, with ``{split}``.
@@ -97,7 +99,7 @@ class LabelMapping:
     lane: tuple[str, ...] = ("lane", "lane marking")
     lane_edges: bool = False
     tasks: tuple[Task, ...] = ()
-    missing: Literal["unlabelled", "empty"] = "unlabelled"
+    missing: Literal["unlabelled", "empty"] | None = None
     split: str = "train"
     splits: tuple[str, ...] = ("train", "val", "test")
     images: str = "images/{split}"
@@ -146,6 +148,30 @@ class LabelMapping:
         if categories & set(self.lane):
             tasks.add("lane")
         return tasks
+
+    def labelled_in(self, labels: Labels, tasks: set[Task]) -> set[Task]:
+        """Return for which of its file's tasks an image is labelled; what is ignored, or of no class, tells of none."""
+        if self.missing != "unlabelled":
+            return tasks
+        known = {category for members in self.classes.values() for category in members}.difference(self.ignore)
+        there: dict[Task, bool] = {
+            "detection": any(item.category in known for item in labels.objects),
+            "drivable": any(area.kind != "ignore" for area in labels.areas),
+            "lane": bool(labels.lanes),
+        }
+        return {task for task in tasks if there[task]}
+
+    def tell_empty(self, records: Mapping[str, Iterable[ImageRecord]]) -> list[str]:
+        """Return a line for each split with images that have no label and are taken as empty, though nobody said so."""
+        if self.missing is not None:
+            return []
+        counts = {split: sum(map(_is_empty, items)) for split, items in records.items()}
+        return [
+            f"{split}: {count} images without any label are taken as looked at, with nothing there; "
+            "'missing: unlabelled' in the file of --classes leaves them unlabelled"
+            for split, count in counts.items()
+            if count
+        ]
 
     def check_categories(self, categories: set[str], root: Path) -> None:
         """Refuse a data set whose categories all mean nothing, of which no label would be left.
@@ -197,6 +223,12 @@ class Labels:
             dropped=dict(self.dropped),
             size=size if all(size) else None,
         )
+
+
+def _is_empty(record: ImageRecord) -> bool:
+    """Return whether an image is labelled, and all of its labels are empty."""
+    labels = [label for label in (record.objects, record.drivable, record.lane) if label is not None]
+    return bool(labels) and not any(labels)
 
 
 def read_mapping(path: str | Path | None) -> LabelMapping:

@@ -67,7 +67,7 @@ class YoloSource:
         """
         image = self._images[split][name]
         path = _label_path(image)
-        if not path.is_file() and self._mapping.missing == "unlabelled":
+        if not path.is_file() and self._mapping.missing != "empty":
             return ImageRecord(name, image)
         text = _read_text(path) if path.is_file() else ""
         return self._parse(text, path, image).record(name, image, self._tasks)
