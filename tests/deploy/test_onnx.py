@@ -1,6 +1,10 @@
 from __future__ import annotations
 
 import logging
+import sys
+import threading
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -157,6 +161,35 @@ def test_quantisers_are_quiet_and_others_heard_again(caplog: pytest.LogCaptureFi
         log.warning("of the quantiser")
     log.warning("of others")
     assert caplog.messages == ["of others"]
+
+
+def test_other_threads_and_errors_are_heard_beside_quantisers(caplog: pytest.LogCaptureFixture) -> None:
+    with quiet(), ThreadPoolExecutor(1) as others:
+        new = logging.getLogger("somebody.new")
+        new.addHandler(caplog.handler)
+        new.propagate = False
+        for log in (logging.getLogger("somebody"), logging.root, new):
+            log.warning("of the quantiser")
+            others.submit(log.warning, "of others").result()
+            log.error("an error")
+    new.removeHandler(caplog.handler)
+    assert caplog.messages == ["of others", "an error"] * 3
+
+
+def test_quantisers_of_two_threads_leave_the_process_as_it_was() -> None:
+    before = sys.stdout, logging.Logger.handle, list(warnings.filters)
+    entered = threading.Event()
+
+    def quantise() -> None:
+        with quiet():
+            entered.set()
+
+    first, other = quiet(), threading.Thread(target=quantise)
+    with first:
+        other.start()
+        assert not entered.wait(0.2)
+    other.join()
+    assert (sys.stdout, logging.Logger.handle, list(warnings.filters)) == before
 
 
 def test_trtexec_line() -> None:

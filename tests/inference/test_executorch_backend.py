@@ -64,6 +64,15 @@ def test_load_finds_it_and_another_process_may_have_it(program: Path) -> None:
         trilitenet.load(program, backend="openvino")
 
 
+def test_it_stays_the_same_where_the_process_changes_its_folder(
+    program: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(program.parent)
+    backend = ExecuTorchBackend(program.name)
+    monkeypatch.chdir(tmp_path)
+    assert pickle.loads(pickle.dumps(backend)).canvas == SIZE  # noqa: S301 - its own
+
+
 def test_a_fork_is_told_to_load_it_itself(program: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     backend = ExecuTorchBackend(program)
     process = os.getpid()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 import os
@@ -10,18 +11,20 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import trilitenet
 from tests.artefacts import SIZE, Artefacts, check_backend
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
 from trilitenet.errors import BackendError, ConfigError, ShapeError, WeightsError
-from trilitenet.inference.exported import is_int8_onnx, prepare_input, read_metadata
+from trilitenet.inference.exported import ArtefactBackend, is_int8_onnx, prepare_input, read_metadata
 from trilitenet.inference.ncnn_backend import NcnnBackend
 from trilitenet.inference.onnx_backend import OnnxBackend
 from trilitenet.inference.openvino_backend import OpenVINOBackend
@@ -110,10 +113,10 @@ def test_a_predictor_goes_to_other_processes(artefacts: Artefacts, name: str, ki
         pytest.importorskip("pnnx")
         pytest.importorskip("ncnn")
     predictor = trilitenet.Predictor(kind(artefacts.folder / name, threads=1), batch_size=3)
-    copy = pickle.loads(pickle.dumps(predictor))  # noqa: S301 - its own
-    assert (copy.backend.name, copy.batch_size) == (predictor.backend.name, 3)
-    assert copy.backend._threads == 1
-    for one, other in zip(predictor([*artefacts.images]), copy([*artefacts.images]), strict=True):
+    again = pickle.loads(pickle.dumps(predictor))  # noqa: S301 - its own
+    assert (again.backend.name, again.batch_size) == (predictor.backend.name, 3)
+    assert again.backend._threads == 1
+    for one, other in zip(predictor([*artefacts.images]), again([*artefacts.images]), strict=True):
         assert one.lane is not None
         np.testing.assert_array_equal(other.lane, one.lane)
 
@@ -132,6 +135,33 @@ def test_another_process_may_work_in_another_folder(
     data = pickle.dumps(kind(name))
     monkeypatch.chdir(tmp_path)
     assert pickle.loads(data).canvas == SIZE  # noqa: S301 - its own
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("model.onnx", OnnxBackend),
+        ("model.onnx", OpenVINOBackend),
+        ("model.xml", OpenVINOBackend),
+        ("model.ncnn.param", NcnnBackend),
+    ],
+)
+def test_a_model_stays_the_same_where_the_process_changes_its_folder(
+    artefacts: Artefacts, name: str, kind: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if kind is NcnnBackend:
+        pytest.importorskip("pnnx")
+        pytest.importorskip("ncnn")
+    monkeypatch.chdir(artefacts.folder)
+    backend = kind(name, threads=2)
+    monkeypatch.chdir(tmp_path)
+    with backend.in_parallel() as runners:
+        assert runners == 2
+    assert pickle.loads(pickle.dumps(backend)).canvas == SIZE  # noqa: S301 - its own
+    assert copy.deepcopy(backend).canvas == SIZE
+    backend.close()
+    with pytest.raises(BackendError, match=f"^{re.escape(name)}: the model was closed"):  # as it was given
+        backend.run(artefacts.images)
 
 
 def test_streams_and_precision_go_with_it(artefacts: Artefacts) -> None:
@@ -415,6 +445,20 @@ def test_input_forms() -> None:
     planes = prepare_input(image, ArtefactInfo("onnx", input="float_nchw"))
     assert planes.dtype == np.float32
     assert np.array_equal(planes[0].transpose(1, 2, 0), image)
+
+
+def test_images_of_different_numbers_of_boxes_share_a_batch() -> None:
+    class Suppressed(ArtefactBackend):
+        name, info, _card = "fake", ArtefactInfo("onnx", size=SIZE, nms=True), ModelCard("tiny", tasks=("detection",))
+
+        def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
+            return [{"detection": np.ones((1, int(image.max()), 6), np.float32)} for image in batch]
+
+    counts = np.array([3, 0, 1, 2], np.uint8)
+    batch = np.broadcast_to(counts[:, None, None, None], (4, *SIZE, 3))
+    detection = Suppressed().run(batch).detection
+    assert detection is not None
+    np.testing.assert_array_equal(detection, np.repeat(np.arange(3) < counts[:, None], 6, 1).reshape(4, 3, 6))
 
 
 def test_engine_files(tmp_path: Path) -> None:

@@ -2,15 +2,19 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import pickle
 import weakref
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 import trilitenet
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
 from trilitenet.errors import BackendError, ShapeError
+from trilitenet.inference.exported_torch_backend import ExportedTorchBackend
 from trilitenet.inference.torch_backend import TorchBackend, check_threads, pick_device
 from trilitenet.models.trilitenet import build_network
 
@@ -138,6 +142,33 @@ def test_in_parallel_each_thread_has_cores_of_its_own(backend: TorchBackend, rng
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("first_leaves_first", [True, False])
+def test_two_uses_in_parallel_share_threads_and_the_last_one_restores(
+    backend: TorchBackend, first_leaves_first: bool
+) -> None:
+    def of_new_threads() -> int:
+        with ThreadPoolExecutor(1) as new:
+            return new.submit(torch.get_num_threads).result()
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(8)
+    try:
+        with ThreadPoolExecutor(1) as one, ThreadPoolExecutor(1) as two:
+            threads = [one, two]
+            assert [each.submit(torch.get_num_threads).result() for each in threads] == [8, 8]
+            uses = [TorchBackend(backend.network, "cpu").in_parallel() for _ in threads]
+            assert [each.submit(use.__enter__).result() for each, use in zip(threads, uses, strict=True)] == [4, 4]
+            assert of_new_threads() == 2
+            leaving = [0, 1] if first_leaves_first else [1, 0]
+            for index in leaving:
+                assert of_new_threads() == 2
+                threads[index].submit(uses[index].__exit__, None, None, None).result()
+            assert [each.submit(torch.get_num_threads).result() for each in threads] == [8, 8]
+        assert of_new_threads() == torch.get_num_threads() == 8
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_batches_are_checked_and_left_as_they_are() -> None:
     backend = TorchBackend(build_network("tiny", tasks=("lane",)), "cpu")
     for batch in (
@@ -164,6 +195,18 @@ def test_pixels_are_normalised_as_the_card_says(rng: np.random.Generator) -> Non
     assert lane is not None
     assert found is not None
     assert np.abs(found - lane.softmax(1)[:, 1].numpy() * 255).max() <= 0.51
+
+
+def test_a_program_stays_the_same_where_the_process_changes_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    metadata = {CARD_KEY: ModelCard("tiny").to_json(), ARTEFACT_KEY: ArtefactInfo("torch", size=(64, 128)).to_json()}
+    program = torch.export.export(torch.nn.Identity(), (torch.zeros(1),))
+    torch.export.save(program, tmp_path / "a.pt2", extra_files=metadata)
+    monkeypatch.chdir(tmp_path)
+    backend = ExportedTorchBackend("a.pt2")
+    monkeypatch.chdir(Path(__file__).parent)
+    assert pickle.loads(pickle.dumps(backend)).canvas == (64, 128)  # noqa: S301 - its own
 
 
 def test_a_fork_is_told_that_it_lacks_the_threads(backend: TorchBackend, monkeypatch: pytest.MonkeyPatch) -> None:

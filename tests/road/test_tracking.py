@@ -79,6 +79,19 @@ def test_a_late_frame_has_no_identity_and_ends_none() -> None:
     assert seen[3] == seen[5] == seen[6] > 0
 
 
+def test_a_vehicle_keeps_its_number_in_a_crowd_that_comes_and_goes() -> None:
+    pytest.importorskip("edgefirst.tracker")
+    tracker = VehicleTracker(memory=1.0)
+    crowd = [100.0 * place for place in range(1, 514)]
+    seen = [tracker.update(boxes(0.0, *crowd), frame / 30).track_id for frame in range(3)][-1]
+    assert seen is not None
+    assert len(set(seen.tolist()) - {-1}) == 514
+    assert tracker.update(boxes(*crowd), 3 / 30).track_id is not None  # hidden for a frame
+    again = tracker.update(boxes(0.0, *crowd), 4 / 30).track_id
+    assert again is not None
+    assert again.tolist() == seen.tolist()
+
+
 def test_times_out_of_range_are_refused() -> None:
     pytest.importorskip("edgefirst.tracker")
     for memory in (-1.0, float("inf"), float("nan")):
@@ -137,6 +150,12 @@ def test_smoothing_follows_a_lasting_change_and_a_new_size() -> None:
     assert smoother.update(np.ones((5, 5), bool)).shape == (5, 5)
     with pytest.raises(ConfigError, match="below 1"):
         MaskSmoother(1.0)
+
+
+def test_what_is_in_half_of_the_mean_is_off() -> None:
+    smoother = MaskSmoother(0.5)
+    on, off = np.ones((2, 2), np.bool_), np.zeros((2, 2), np.bool_)
+    assert [bool(smoother.update(mask).any()) for mask in (off, on, on)] == [False, False, True]
 
 
 def test_masks_may_lie_column_by_column(rng: np.random.Generator) -> None:

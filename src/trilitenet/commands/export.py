@@ -152,6 +152,9 @@ def export(
     The artefact is compared with the float32 network on frames before it is kept: beyond the tolerance nothing is
     written. Load it with `trilitenet.load`, which needs nothing else.
 
+    While it converts and quantises, warnings and standard output of the whole process are off, and what this thread
+    logs below errors; exports of several threads take turns there.
+
     Args:
         model: Name of shipped weights, or a file of weights.
         format: onnx, openvino (.xml and .bin), ncnn (.ncnn.param, .bin and .json), executorch (.pte), tensorrt

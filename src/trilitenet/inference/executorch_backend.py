@@ -46,6 +46,7 @@ class ExecuTorchBackend(ArtefactBackend):
         self._path, self._threads = Path(path), threads
         if not self._path.is_file():
             raise WeightsError(f"{self._path}: no such file")
+        self._file = self._path.absolute()  # which stays the same where the process changes its folder
         with _unsaid():
             # Not executorch.runtime, which is the same behind 6 seconds of imports for exporting.
             runtime = import_extra("executorch.extension.pybindings._portable_lib", "executorch")
@@ -70,7 +71,7 @@ class ExecuTorchBackend(ArtefactBackend):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle it as what opens it again: its file, which must be there, and its options."""
-        return functools.partial(ExecuTorchBackend, self._path.absolute(), threads=self._threads), ()
+        return functools.partial(ExecuTorchBackend, self._file, threads=self._threads), ()
 
     @property
     def name(self) -> str:

@@ -54,7 +54,7 @@ class ExportedTorchBackend(ArtefactBackend):
         found = {key: value.decode() if isinstance(value, bytes) else value for key, value in metadata.items() if value}
         self._card, self.info = read_metadata(found, str(path))
         self.device = pick_device("cpu" if device == "auto" else device)
-        self._path = path
+        self._path, self._file = path, path.absolute()  # which stays the same where the process changes its folder
         if self.device.type != "cpu":  # the program makes tensors of its own, and checks where its inputs are
             from torch.export.passes import move_to_device_pass  # which few need
 
@@ -63,7 +63,7 @@ class ExportedTorchBackend(ArtefactBackend):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle it as what opens it again: its file, which must be there, and its device."""
-        return ExportedTorchBackend, (self._path.absolute(), str(self.device))
+        return ExportedTorchBackend, (self._file, str(self.device))
 
     @property
     def name(self) -> str:

@@ -58,6 +58,7 @@ class NcnnBackend(ParallelSessions, ArtefactBackend):
             raise ConfigError(f"unknown precision {precision!r}; known: fp32, fp16")
         self._path, self._threads = _find(Path(path)), threads
         self._card, self.info = _read(self._path)
+        self._file = self._path.absolute()  # which stays the same where the process changes its folder
         wanted = precision or self.info.precision
         self.precision = "fp16" if wanted == "fp16" and self._ncnn.cpu_support_arm_asimdhp() else "fp32"
         self._device = "cpu"
@@ -70,7 +71,7 @@ class NcnnBackend(ParallelSessions, ArtefactBackend):
         net.opt.use_fp16_packed = net.opt.use_fp16_storage = net.opt.use_fp16_arithmetic = half
         if threads is not None:
             net.opt.num_threads = threads
-        if net.load_param(str(self._path)) or net.load_model(str(self._path.with_suffix(".bin"))):
+        if net.load_param(str(self._file)) or net.load_model(str(self._file.with_suffix(".bin"))):
             raise WeightsError(f"{self._path}: not a usable NCNN model (its layers or their weights cannot be read)")
         missing = {"image", *self._card.tasks} - {*net.input_names(), *net.output_names()}
         if missing:
@@ -79,9 +80,7 @@ class NcnnBackend(ParallelSessions, ArtefactBackend):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle it as what opens it again: its file, which must be there, and its options."""
-        return functools.partial(
-            NcnnBackend, self._path.absolute(), precision=self.precision, threads=self._threads
-        ), ()
+        return functools.partial(NcnnBackend, self._file, precision=self.precision, threads=self._threads), ()
 
     @property
     def name(self) -> str:

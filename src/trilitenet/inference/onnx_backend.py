@@ -45,7 +45,8 @@ class OnnxBackend(ParallelSessions, ArtefactBackend):
         providers = ["CPUExecutionProvider"]
         if device != "cpu" and "CUDAExecutionProvider" in available:
             providers.insert(0, "CUDAExecutionProvider")
-        self._runtime, self._path, self._providers, self._threads = runtime, path, providers, threads
+        self._runtime, self._providers, self._threads = runtime, providers, threads
+        self._path, self._file = path, path.absolute()  # which stays the same where the process changes its folder
         self._session = self._open(threads)
         self._card, self.info = read_metadata(self._session.get_modelmeta().custom_metadata_map, str(path))
         inputs = self._session.get_inputs()
@@ -63,14 +64,14 @@ class OnnxBackend(ParallelSessions, ArtefactBackend):
         if threads is not None:
             options.intra_op_num_threads = threads
         try:
-            return self._runtime.InferenceSession(str(self._path), options, providers=self._providers)
+            return self._runtime.InferenceSession(str(self._file), options, providers=self._providers)
         except Exception as error:  # its exceptions share no base class of their own
             reason = "cut off or damaged; export it again" if "INVALID_PROTOBUF" in str(error) else gist(error)
             raise WeightsError(f"{self._path}: not a usable ONNX model ({reason})") from error
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle it as what opens it again: its file, which must be there, and its options."""
-        return functools.partial(OnnxBackend, self._path.absolute(), self._device, threads=self._threads), ()
+        return functools.partial(OnnxBackend, self._file, self._device, threads=self._threads), ()
 
     @property
     def name(self) -> str:

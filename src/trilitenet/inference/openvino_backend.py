@@ -103,7 +103,8 @@ class OpenVINOBackend(ArtefactBackend):
             raise ConfigError(f"unknown precision {wanted!r}; known: {', '.join(_HINTS)}")
         capable = {str(name).lower() for name in core.get_property(self._device, "OPTIMIZATION_CAPABILITIES")}
         self.precision = wanted if wanted in capable else "fp32"
-        self._core, self._model, self._path, self._threads = core, model, path, threads
+        self._core, self._model, self._threads = core, model, threads
+        self._path, self._file = path, path.absolute()  # which stays the same where the process changes its folder
         self.streams = streams
         self._process = os.getpid()
         compiled = self._compile(streams)
@@ -130,7 +131,7 @@ class OpenVINOBackend(ArtefactBackend):
         """Pickle it as what opens it again: its file, which must be there, and its options."""
         reopen = functools.partial(
             OpenVINOBackend,
-            self._path.absolute(),
+            self._file,
             self._device,
             precision=self.precision,
             streams=self.streams,

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Final
 
 import numpy as np
 import torch
@@ -13,7 +15,7 @@ from torch import Tensor
 
 from trilitenet.config import MAX_STRIDE, ModelCard
 from trilitenet.errors import BackendError
-from trilitenet.inference.backend import MOST_PARALLEL, check_batch, held, out_of_memory
+from trilitenet.inference.backend import MOST_PARALLEL, check_batch, held, out_of_memory, replaced
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
 from trilitenet.processing.memory import lacks_memory
 from trilitenet.structures import RawOutputs
@@ -145,15 +147,34 @@ class TorchBackend:
         if count == 1:
             yield 1
             return
-        torch.set_num_threads(cores // count)  # for threads that begin now
-        try:
+        with replaced(_NEW_THREADS, "number", lambda: cores // count):
             yield count
-        finally:
-            torch.set_num_threads(cores)
 
     def close(self) -> None:
         """Let the network go."""
         self._network = self._graph = None
+
+
+class _NewThreads:
+    """Threads that begin, to which PyTorch gives the number last set by any; one that has worked keeps its own.
+
+    Read and set in a thread of its own: set in one that works, it would be that one's number too, and of those that
+    share it (see `replaced`) the first to come need not be the last to go.
+    """
+
+    @property
+    def number(self) -> int:
+        """PyTorch's threads for each of them."""
+        with ThreadPoolExecutor(1) as new:
+            return new.submit(torch.get_num_threads).result()
+
+    @number.setter
+    def number(self, number: int) -> None:
+        with ThreadPoolExecutor(1) as new:
+            new.submit(torch.set_num_threads, number).result()
+
+
+_NEW_THREADS: Final = _NewThreads()
 
 
 def _foreground(logits: Tensor) -> NDArray[np.uint8]:
