@@ -284,7 +284,7 @@ def test_data_of_other_classes_are_told(
 ) -> None:
     model = str(artefacts.folder / "model.onnx")
     evaluate(model, data=data, backend="onnxruntime", limit=1, resamples=0, worst=0)
-    assert "is of the class class_0, class_1, and those of car are of none" in caplog.text
+    assert "is of the class class_0, class_1, and those of bus, car, truck are of none" in caplog.text
     caplog.clear()
     evaluate(str(weights), data=data, limit=1, resamples=0, worst=0)
     assert not caplog.text

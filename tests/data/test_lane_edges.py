@@ -85,3 +85,18 @@ def test_of_many_edges_the_nearest_are_paired_first() -> None:
     left = [np.stack([np.full_like(y, 14.0 * number), y], axis=1) for number in range(7)]
     right = [line + np.array([4.0, 0.0]) for line in left]
     assert pair_edges([*left, *right], max_gap=20.0).pairs == tuple((number, number + 7) for number in range(7))
+
+
+@pytest.mark.parametrize("count", [12, 14, 40])
+def test_a_chain_of_any_length_leaves_no_edge_alone(count: int) -> None:
+    """At about equal distances: nearest first would leave edges alone between the pairs."""
+    order = np.random.default_rng(1).permutation(count)
+    places = [100 + 20 * k + 0.05 * (k * 7 % 3) for k in order]
+    pairing = pair_edges([np.array([[x, 700.0], [x, 300.0]]) for x in places])
+    assert pairing.single == ()
+    assert all(abs(int(order[a]) - int(order[b])) == 1 for a, b in pairing.pairs)
+
+
+def test_a_heap_of_edges_is_paired_whole() -> None:
+    lines = [np.array([[0.7 * k, 0.0], [0.7 * k, 200.0]]) for k in range(20)]
+    assert pair_edges(lines).pairs == tuple((2 * k, 2 * k + 1) for k in range(10))

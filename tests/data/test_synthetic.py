@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,14 @@ from PIL import Image
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.sample import Sample
 from trilitenet.data.synthetic import Scene, SyntheticScenes
-from trilitenet.data.synthetic_chance import random_layout
+from trilitenet.data.synthetic_chance import random_layout, random_world
 from trilitenet.data.synthetic_drive import SyntheticDrive
 from trilitenet.data.synthetic_files import annotation, write_dataset
 from trilitenet.data.synthetic_render import FIRST_VEHICLE, render
-from trilitenet.data.synthetic_vehicles import VehiclePose
-from trilitenet.data.synthetic_world import Course, Vehicle
+from trilitenet.data.synthetic_vehicles import VehiclePose, draw_shadow, in_front
+from trilitenet.data.synthetic_world import FAR, Course, Vehicle
 from trilitenet.errors import Claim, ConfigError, OutputError
+from trilitenet.processing.geometry import Camera
 
 SIZE = (192, 320)
 
@@ -69,6 +71,15 @@ def test_a_tall_picture_shows_what_reaches_behind_the_camera(size: tuple[int, in
     assert SyntheticScenes(1, size)[index].image.shape == (*size, 3)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_shadow_that_reaches_behind_the_camera() -> None:
+    """Of a bus before a camera that looks steeply up."""
+    camera = Camera.from_field_of_view((128, 32), 80.0, 1.4, pitch=-0.9)
+    image = np.full((128, 32, 3), 200, np.uint8)
+    draw_shadow(image, camera, VehiclePose(Vehicle("bus", 1.6, 0.0, 0.0, (9.0, 9.0, 9.0)), 1.6, 0.0, 0.0), 0.75)
+    assert image.min() < 100
+
+
 def test_night_is_darker_than_day(scenes: list[Scene]) -> None:
     bright = {"daytime": [0.0], "night": [0.0]}
     for scene in scenes:
@@ -85,10 +96,11 @@ def test_masks_stop_at_vehicles(scenes: list[Scene]) -> None:
     assert not (drawn.lines.astype(bool) & vehicles).any()
 
 
-def test_boxes_are_the_visible_part_of_the_outline() -> None:
-    drive = SyntheticDrive(2, frames=10, size=(360, 640), faults=False)
-    drawn = render(drive.world(0.0), np.random.default_rng(0), faults=False)
-    scene = drive[0]
+@pytest.mark.parametrize(("seed", "index"), [(2, 0), (0, 110)])  # the second has a truck beside the camera
+def test_boxes_are_the_visible_part_of_the_outline(seed: int, index: int) -> None:
+    drive = SyntheticDrive(seed, frames=1500, size=(360, 640), faults=False)
+    drawn = render(drive.world(index / 25), np.random.default_rng(0), faults=False)
+    scene = drive[index]
     assert scene.sample.boxes is not None
     for box in scene.sample.boxes:
         left, top, right, bottom = (round(float(v)) for v in box)
@@ -144,8 +156,17 @@ def test_refuses_nonsense() -> None:
         SyntheticScenes(labels="dots")  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="size"):
         SyntheticScenes(size=(8, 8))
+    with pytest.raises(ConfigError, match="seed must not be negative, got -1"):
+        SyntheticScenes(-1)
+    with pytest.raises(ConfigError, match="count must not be negative, got -1"):
+        SyntheticScenes(count=-1)
     with pytest.raises(ConfigError, match="at least one frame"):
         SyntheticDrive(frames=0)
+    for fps in (0.0, math.nan, math.inf):
+        with pytest.raises(ConfigError, match="positive rate"):
+            SyntheticDrive(fps=fps)
+    with pytest.raises(ConfigError, match="seed must not be negative, got -1"):
+        SyntheticDrive(seed=-1)
 
 
 @pytest.mark.parametrize("size", ["96x160", 96, (96.5, 160), (96, 160, 3)])
@@ -235,6 +256,43 @@ def test_an_image_that_is_there_has_its_labels_when_the_disk_is_full(
     assert {path.suffix for path in tmp_path.rglob("*") if path.is_file()} == {".json", ".yaml"}
 
 
+def test_vehicles_are_written_by_what_they_are(tmp_path: Path) -> None:
+    size = (64, 96)
+    write_dataset(tmp_path, "train", count=12, seed=4, size=size)
+    names = ("car", "truck", "bus")
+    one = DrivingDataset(tmp_path, "train")
+    each = DrivingDataset(tmp_path, "train", class_names=names, classes={name: (name,) for name in names})
+    seen = set[str]()
+    for index in range(12):
+        kinds = [thing.kind for thing in SyntheticScenes(4, size).scene(index).truth.objects if not thing.ignored]
+        expected = [{"bus": "bus", "truck": "truck", "lorry": "truck"}.get(kind, "car") for kind in kinds]
+        as_one, as_each = one[index].class_id, each[index].class_id
+        assert as_one is not None
+        assert as_each is not None
+        assert [one.class_names[number] for number in as_one] == ["vehicle"] * len(kinds)
+        assert [names[number] for number in as_each] == expected
+        seen.update(kinds)
+    assert {"bus", "truck", "lorry", "van"} <= seen
+
+
+def test_a_description_that_leaves_vehicles_out_is_refused(tmp_path: Path) -> None:
+    """As one that is of an earlier state, which called all vehicles cars."""
+    (tmp_path / "dataset.yaml").write_text("classes: {vehicle: [car]}\nignore: [bus]\n")
+    with pytest.raises(OutputError, match=r"dataset\.yaml leaves out truck: add each to a class or to `ignore`"):
+        write_dataset(tmp_path, "val", count=1, size=SIZE)
+    assert [path.name for path in tmp_path.iterdir()] == ["dataset.yaml"]
+    (tmp_path / "images/val").mkdir(parents=True)
+    (tmp_path / "images/val/synthetic_0_000000.jpg").touch()
+    state = tmp_path / ".synthesis-val.json"
+    state.write_text(json.dumps({"seed": 0, "count": 1, "size": SIZE, "labels": "lines"}))
+    with pytest.raises(OutputError, match="not what the same command left"):
+        write_dataset(tmp_path, "val", count=1, size=SIZE)
+    shutil.rmtree(tmp_path / "images")
+    (tmp_path / "dataset.yaml").write_text("classes: {light: [car], heavy: [truck, bus]}\n")
+    write_dataset(tmp_path, "val", count=1, size=SIZE)
+    assert DrivingDataset(tmp_path, "val").class_names == ("light", "heavy")
+
+
 def test_uncertain_vehicles_are_written_as_crowd() -> None:
     sample = Sample(
         "a", np.zeros((4, 4, 3), np.uint8), np.array([[0, 0, 2, 2]], np.float32), np.zeros(1, np.int64),
@@ -269,6 +327,38 @@ def test_a_drive_changes_lanes_and_has_a_lead() -> None:
     assert drive[0].truth.camera == drive[240].truth.camera
 
 
+def test_a_vehicle_that_is_passed_leaves_by_the_edge_of_the_picture() -> None:
+    drive = SyntheticDrive(0, frames=1500, size=(90, 160), faults=False)
+    passed = [
+        [thing for thing in drive[index].truth.objects if thing.number == 3]  # a truck on the right, 10.5 m long
+        for index in range(45, 162, 6)
+    ]
+    ahead = [things[0] for things in passed if things]
+    assert passed[: len(ahead)] == [[thing] for thing in ahead]  # once it is gone it stays so
+    lefts = [float(thing.box[0]) for thing in ahead]
+    assert lefts == sorted(lefts)
+    assert lefts[-1] > 150
+    assert ahead[-1].distance < -5
+    assert not any(thing.ignored for thing in ahead[:-2])
+    beside = np.array([thing.box for thing in ahead if thing.distance < 2])
+    assert (beside[:, 2] == 160).all()
+    assert (beside[1:8, 3] < 72).all()  # while the rear wheels are out of sight
+
+
+def test_single_scenes_have_no_vehicle_beside_the_camera() -> None:
+    for index in (65, 71, 147):  # each with traffic that would begin there
+        world = random_world(np.random.default_rng((0, index)), SIZE)
+        assert min(world.course.at(car.s, car.d)[0] for car in world.vehicles) > 2
+
+
+def test_the_barriers_of_a_drive_do_not_travel_along() -> None:
+    """Seed 5 has a guard rail on the right that would begin at 15 m."""
+    drive = SyntheticDrive(5, frames=2, size=(90, 160), faults=False)
+    for barrier in drive.world(0.0).layout.barriers:
+        assert (barrier.start, barrier.end) == (0.0, FAR)
+    assert any(barrier.d < 0 for barrier in drive.world(0.0).layout.barriers)
+
+
 def test_the_truth_is_told_from_the_own_lane(scenes: list[Scene]) -> None:
     bends = 0
     for truth in (scene.truth for scene in scenes):
@@ -299,6 +389,7 @@ def test_the_lead_is_the_nearest_in_the_own_lane_that_is_seen(scenes: list[Scene
     side = truth.lane_width / 2 + 0.1
     assert lead((40, 0.3, False), (10, 0, True), (15, side, False), (30, -0.3, False)) == 30
     assert lead((15, side, False), (10, 0, True)) is None
+    assert lead((-3, 0, False), (20, 0, False)) == 20  # one that is beside is not ahead
 
 
 def test_a_layout_in_the_mirror() -> None:
@@ -327,6 +418,17 @@ def test_a_vehicle_is_placed_by_the_end_that_is_nearest(yaw: float) -> None:
     length, width = pose.shape.length * 1.05, pose.shape.width * 1.05
     np.testing.assert_allclose([box[:, 0].min(), box[:, 0].max()], [20, 20 + length])
     np.testing.assert_allclose([box[:, 1].min(), box[:, 1].max()], [1 - width / 2, 1 + width / 2])
+
+
+def test_a_polygon_is_cut_off_before_the_camera() -> None:
+    camera = Camera.from_field_of_view((90, 160), 60.0, 1.4)
+    square = np.array([[-3.0, 2.0, 0.0], [5.0, 2.0, 0.0], [5.0, 4.0, 0.0], [-3.0, 4.0, 0.0]])
+    cut = in_front(camera, square)
+    assert len(cut) == 4
+    np.testing.assert_allclose([cut.min(axis=0), cut.max(axis=0)], [[1, 2, 0], [5, 4, 0]])
+    ahead = np.array([5.0, 0.0, 0.0])
+    np.testing.assert_array_equal(in_front(camera, square + ahead), square + ahead)
+    assert len(in_front(camera, square - 2 * ahead)) == 0
 
 
 def test_the_way_aside_and_its_rate_agree() -> None:

@@ -57,7 +57,8 @@ def synthesize(
         workers: Processes to share the work.
 
     Raises:
-        OutputError: If the split is there already, whole or of another command.
+        OutputError: If the split is there already, whole or of another command, or the folder's ``dataset.yaml`` leaves
+            vehicles out.
     """
     with show_progress("scenes") as shown:
         write_dataset(output, split, count, seed, size=size, labels=labels, workers=workers, progress=shown)

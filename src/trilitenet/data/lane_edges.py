@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
+import heapq
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,8 +20,8 @@ _GAP_POINTS = 24
 _MIN_OVERLAP = 0.5
 """Two edges of one marking run beside each other over at least this part of the shorter one."""
 
-_EXACT_LIMIT = 12
-"""Up to so many edges that could be partners of each other are paired optimally; more, greedily."""
+_MOST_CHOICES = 1000
+"""So many ways to pair are followed at once; twelve edges have fewer, and so have more that do not lie in a heap."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +73,8 @@ def pair_edges(lines: Sequence[NDArray[np.float64]], max_gap: float = 40.0) -> P
     """Pair the edges of lane markings of one kind so that the sum of their gaps is least.
 
     Leaving two edges alone costs ``max_gap``, so that no pair has a wider one; a chain of lines at equal distances is
-    paired so that as few as possible stay alone.
+    paired so that as few as possible stay alone. The sum may be a little above the least where well over a dozen edges
+    are all within ``max_gap`` of each other.
 
     Args:
         lines: (N, 2) x, y each, in pixels: edges of the same type, style and direction.
@@ -89,7 +90,10 @@ def pair_edges(lines: Sequence[NDArray[np.float64]], max_gap: float = 40.0) -> P
                 gaps[first, second] = gap
     pairs: list[tuple[int, int]] = []
     for group in _groups(len(lines), gaps):
-        pairs += _match(group, gaps, max_gap)
+        # From one side to the other, so that partners follow each other closely.
+        middles = np.array([lines[index].mean(axis=0) for index in group])
+        across = middles[:, np.ptp(middles, axis=0).argmax()]
+        pairs += _match([group[place] for place in across.argsort(kind="stable")], gaps, max_gap)
     used = {index for pair in pairs for index in pair}
     return Pairing(tuple(sorted(pairs)), tuple(index for index in range(len(lines)) if index not in used))
 
@@ -193,28 +197,26 @@ def _groups(count: int, gaps: dict[tuple[int, int], float]) -> list[list[int]]:
 
 
 def _match(group: list[int], gaps: dict[tuple[int, int], float], max_gap: float) -> list[tuple[int, int]]:
-    """Return the pairs of least total gap."""
-    if len(group) > _EXACT_LIMIT:
-        pairs: list[tuple[int, int]] = []
-        left = set(group)
-        for first, second in sorted(gaps, key=lambda pair: gaps[pair]):
-            if first in left and second in left:
-                pairs.append((first, second))
-                left -= {first, second}
-        return pairs
+    """Return the pairs of least total gap.
 
-    @functools.cache
-    def best(rest: tuple[int, ...]) -> tuple[float, tuple[tuple[int, int], ...]]:
-        if not rest:
-            return 0.0, ()
-        cost, chosen = best(rest[1:])
-        cost += max_gap / 2
-        for position in range(1, len(rest)):
-            pair = (rest[0], rest[position])
-            if pair in gaps:
-                other, more = best(rest[1:position] + rest[position + 1 :])
-                if other + gaps[pair] < cost:
-                    cost, chosen = other + gaps[pair], (pair, *more)
-        return cost, chosen
-
-    return list(best(tuple(group))[1])
+    Each edge in turn stays alone or takes a later one. Of the ways that have taken the same later edges the best goes
+    on: the one whose gaps are the most below ``max_gap``, in sum. Of too many ways those go on that could gain most,
+    were every edge that is left to find a partner without a gap.
+    """
+    ways: dict[frozenset[int], tuple[float, tuple[tuple[int, int], ...]]] = {frozenset(): (0.0, ())}
+    for place, edge in enumerate(group):
+        pairs = [(min(edge, other), max(edge, other)) for other in group[place + 1 :]]
+        found: dict[frozenset[int], tuple[float, tuple[tuple[int, int], ...]]] = {}
+        for taken, (gain, chosen) in ways.items():
+            after = [(taken - {edge}, gain, chosen)]
+            if edge not in taken:
+                after += [
+                    (taken.union(pair) - {edge}, gain + max_gap - gaps[pair], (*chosen, pair))
+                    for pair in pairs
+                    if pair in gaps and taken.isdisjoint(pair)
+                ]
+            for key, total, these in after:
+                if key not in found or total > found[key][0]:
+                    found[key] = total, these
+        ways = dict(heapq.nlargest(_MOST_CHOICES, found.items(), key=lambda way: way[1][0] - len(way[0]) * max_gap / 2))
+    return list(ways[frozenset()][1])

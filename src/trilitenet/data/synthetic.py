@@ -17,7 +17,7 @@ from trilitenet.config import as_size
 from trilitenet.data.sample import Sample
 from trilitenet.data.synthetic_chance import random_world
 from trilitenet.data.synthetic_render import FIRST_VEHICLE, Rendering, render
-from trilitenet.data.synthetic_vehicles import VehiclePose
+from trilitenet.data.synthetic_vehicles import VehiclePose, in_front
 from trilitenet.data.synthetic_world import World
 from trilitenet.errors import ConfigError
 from trilitenet.processing.geometry import Camera
@@ -62,7 +62,7 @@ class ObjectTruth:
         number: Its identity over the frames of a drive.
         box: (4,) left, top, right, bottom in pixels, of the visible part.
         visible: Share of its outline within the image that nothing hides, in [0, 1].
-        distance: Metres forward to its nearest end (the rear bumper of one ahead).
+        distance: Metres forward to its nearest end (the rear bumper of one ahead); may be negative for one beside.
         lateral: Metres left of the ego vehicle's axis.
         d: Metres left of the ego lane's centre.
         speed: m/s along the road.
@@ -111,7 +111,7 @@ class SceneTruth:
     @property
     def lead(self) -> ObjectTruth | None:
         """The nearest vehicle ahead in the ego lane that is not ignored; None without one."""
-        ahead = [o for o in self.objects if abs(o.d) < self.lane_width / 2 and not o.ignored]
+        ahead = [o for o in self.objects if o.distance > 0 and abs(o.d) < self.lane_width / 2 and not o.ignored]
         return min(ahead, key=lambda o: o.distance, default=None)
 
 
@@ -149,6 +149,9 @@ class SyntheticScenes:
         size = as_size(size)
         if min(size) < 32:
             raise ConfigError(f"size must be at least 32 pixels each way, got {size}")
+        for name, value in (("seed", seed), ("count", count)):
+            if value < 0:
+                raise ConfigError(f"{name} must not be negative, got {value}")
         self.seed, self.size, self.length, self.labels, self.faults = seed, size, count, labels, faults
 
     def __len__(self) -> int:
@@ -261,6 +264,10 @@ def _lines(world: World) -> tuple[LineTruth, ...]:
     return tuple(sorted(found, key=lambda line: -line.d))
 
 
+_ALONG_EDGES: Final = [0, 1, 2, 3, 0, 4, 5, 1, 5, 6, 2, 6, 7, 3, 7, 4]
+"""A closed way along all edges of a block: corners 0 to 3 are its lower ones, 4 to 7 those above them."""
+
+
 def _objects(world: World, drawn: Rendering) -> tuple[ObjectTruth, ...]:
     height, width = world.camera.size
     found: list[ObjectTruth] = []
@@ -303,12 +310,13 @@ def _objects(world: World, drawn: Rendering) -> tuple[ObjectTruth, ...]:
 
 
 def _outline(camera: Camera, pose: VehiclePose) -> tuple[float, float, float, float] | None:
-    """Return the box around the vehicle's eight corners in pixels; None if one is behind the camera."""
+    """Return the box in pixels around what of the block about the vehicle lies before the camera; None if nothing."""
     low = pose.ground_box
     high = low + np.array([0.0, 0.0, pose.shape.height * pose.vehicle.scale])
-    pixels = camera.to_pixels(np.concatenate([low, high]))
-    if np.isnan(pixels).any() or low[:, 0].min() < 0.5:
+    corners = in_front(camera, np.concatenate([low, high])[_ALONG_EDGES])
+    if not len(corners):
         return None
+    pixels = camera.to_pixels(corners)
     left, top = pixels.min(axis=0)
     right, bottom = pixels.max(axis=0)
     return float(left), float(top), float(right), float(bottom)

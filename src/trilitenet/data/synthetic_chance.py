@@ -68,7 +68,8 @@ def random_world(rng: np.random.Generator, size: tuple[int, int]) -> World:
         course=course,
         layout=layout,
         light=light,
-        vehicles=random_traffic(rng, layout),
+        # What is cut off beside the camera is left to drives.
+        vehicles=tuple(car for car in random_traffic(rng, layout) if course.at(car.s, car.d)[0] > 2.0),
         items=random_scenery(rng, layout, urban),
         texture=int(rng.integers(1 << 30)),
         travelled=float(rng.uniform(0, 100)),

@@ -53,8 +53,10 @@ class SyntheticDrive:
         weather: Weather = "clear",
         faults: bool = True,
     ) -> None:
-        if frames < 1 or fps <= 0:
+        if frames < 1 or not 0 < fps < math.inf:
             raise ConfigError(f"a drive needs at least one frame and a positive rate, got {frames} and {fps}")
+        if seed < 0:
+            raise ConfigError(f"seed must not be negative, got {seed}")
         self.seed, self.frames, self.fps, self.faults = seed, frames, fps, faults
         self.camera = Camera.from_field_of_view(as_size(size), 60.0, 1.4, pitch=0.03)
         self.duration = frames / fps
@@ -179,7 +181,7 @@ class _Actor:
         phase = 2 * math.pi * time / self.period
         s = self.start + self.relative * time + self.wave * math.sin(phase)
         rate = self.relative + self.wave * math.cos(phase) * 2 * math.pi / self.period
-        if not 1.0 < s < FAR * 0.8:
+        if not -Course.BEHIND < s < FAR * 0.8:
             return None
         model = self.model
         braking = rate < -2.5 and model.yaw == 0.0
@@ -204,4 +206,6 @@ def _find_layout(rng: np.random.Generator) -> Layout:
     while True:
         layout = random_layout(rng, "motorway")
         if len(layout.lanes) == 3 and abs(layout.lanes[1]) < 1e-9 and all(m.wear < 0.4 for m in layout.markings):
-            return layout
+            # They stand for the whole drive: where they begin and end is told from the ego vehicle.
+            barriers = tuple(dataclasses.replace(barrier, start=0.0, end=FAR) for barrier in layout.barriers)
+            return dataclasses.replace(layout, barriers=barriers)

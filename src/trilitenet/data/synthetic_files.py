@@ -5,22 +5,35 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from trilitenet.config import Task
-from trilitenet.data.description import DESCRIPTION_FILE, DatasetDescription, is_folder_name, write_description
+from trilitenet.data.description import (
+    DESCRIPTION_FILE,
+    DatasetDescription,
+    class_table,
+    is_folder_name,
+    read_description,
+    write_description,
+)
 from trilitenet.data.reading import FOLDERS, IMAGE_FOLDER, label_file
 from trilitenet.data.sample import Sample
-from trilitenet.data.synthetic import LaneLabels, SyntheticScenes
+from trilitenet.data.synthetic import LaneLabels, Scene, SyntheticScenes
 from trilitenet.errors import Claim, ConfigError, OutputError, replacing, writing
 from trilitenet.processing.cores import ProcessPool
 
-__all__ = ["annotation", "write_dataset", "write_sample"]
+__all__ = ["CATEGORIES", "annotation", "write_dataset", "write_sample"]
+
+CATEGORIES: Final = ("car", "truck", "bus")
+"""Categories of the vehicles that are written."""
+_HEAVY: Final = {"truck": "truck", "lorry": "truck", "bus": "bus"}
+"""Kind of a vehicle to its category; the others are cars, as BDD100K has it for vans and pick-ups."""
 
 
 def write_dataset(
@@ -36,10 +49,10 @@ def write_dataset(
 ) -> None:
     """Write scenes in the published layout.
 
-    ``images/{split}/NAME.jpg``, ``det_annotations/{split}/NAME.json`` (BDD100K's form an image; uncertain vehicles have
-    ``attributes.crowd: true``), ``da_seg_annotations/{split}/NAME.png`` and ``ll_seg_annotations/{split}/NAME.png``
-    (255 = drivable or lane line), and ``dataset.yaml``. The same call goes on where one was interrupted; until the
-    split is whole, ``.synthesis-{split}.json`` says of what call it is.
+    ``images/{split}/NAME.jpg``, ``det_annotations/{split}/NAME.json`` (BDD100K's form an image, of the categories
+    `CATEGORIES`; uncertain vehicles have ``attributes.crowd: true``), ``da_seg_annotations/{split}/NAME.png`` and
+    ``ll_seg_annotations/{split}/NAME.png`` (255 = drivable or lane line), and ``dataset.yaml``. The same call goes on
+    where one was interrupted; until the split is whole, ``.synthesis-{split}.json`` says of what call it is.
 
     Args:
         root: Folder to write into.
@@ -54,24 +67,30 @@ def write_dataset(
     Raises:
         ConfigError: If ``count`` or ``workers`` is under 1, the seed negative, the size too small, or ``split`` no name
             of one folder.
-        OutputError: If the split exists already, whole or of another call, a file cannot be written, or the same call
-            is being made elsewhere.
+        DataError: If the folder has a ``dataset.yaml`` that cannot be read.
+        OutputError: If the split exists already, whole or of another call, a ``dataset.yaml`` that is there leaves
+            vehicles out, a file cannot be written, or the same call is being made elsewhere.
     """
     if count < 1 or workers < 1:
         raise ConfigError(f"count and workers must be at least 1, got {count} and {workers}")
-    if seed < 0:
-        raise ConfigError(f"seed must not be negative, got {seed}")
-    SyntheticScenes(seed, size, count, labels=labels)  # refuses a wrong size before there is a folder
+    SyntheticScenes(seed, size, count, labels=labels)  # refuses what is wrong before there is a folder
     root = Path(root)
     if not is_folder_name(split):
         raise ConfigError(f"split must be the name of one folder, got {split!r}")
     state = root / f".synthesis-{split}.json"
-    call = json.dumps({"seed": seed, "count": count, "size": size, "labels": labels}).encode()
+    call = json.dumps({"seed": seed, "count": count, "size": size, "labels": labels, "categories": CATEGORIES}).encode()
     images = root / IMAGE_FOLDER / split
     if any(images.glob("*")) and not (state.is_file() and state.read_bytes() == call):
         raise OutputError(
             f"{images} is not empty, and not what the same command left when it was interrupted; "
             "choose another folder or split, or remove it"
+        )
+    present = read_description(root)
+    known = {*class_table(present.class_names, present.classes, root), *present.ignore}
+    if left_out := [category for category in CATEGORIES if category not in known]:
+        raise OutputError(
+            f"{root / DESCRIPTION_FILE} leaves out {', '.join(left_out)}: add each to a class or to `ignore` there, "
+            "or choose another folder"
         )
     with contextlib.ExitStack() as stack:
         stack.enter_context(writing(root))
@@ -88,7 +107,7 @@ def write_dataset(
                 root,
                 DatasetDescription(
                     name="synthetic road scenes",
-                    classes={"vehicle": ("car",)},
+                    classes={"vehicle": CATEGORIES},
                     attributes=("timeofday", "weather", "scene", "source"),
                     licence="MIT, as the generator",
                     source="trilitenet data synthesize; the names of the images hold the seed",  # one a split
@@ -110,17 +129,30 @@ def _write_scene(
 ) -> None:
     scenes = SyntheticScenes(seed, size, count, labels=labels)
     if not (root / IMAGE_FOLDER / split / f"{scenes.name(index)}.jpg").exists():
-        write_sample(root, split, scenes[index])
+        scene = scenes.scene(index)
+        write_sample(root, split, scene.sample, _categories(scene))
 
 
-def write_sample(root: Path, split: str, sample: Sample) -> None:
+def _categories(scene: Scene) -> list[str]:
+    """Return the category of each box of a scene's sample, then of each ignored one."""
+    objects = sorted(scene.truth.objects, key=lambda thing: thing.ignored)
+    return [_HEAVY.get(thing.kind, "car") for thing in objects]
+
+
+def write_sample(root: Path, split: str, sample: Sample, categories: Sequence[str] = ()) -> None:
     """Write one sample; a task that is not labelled has no file.
 
     The image comes last: should the writing end, by a full disk for example, each image that is there has its labels.
+
+    Args:
+        root: Folder of the data set.
+        split: Name of the split.
+        sample: What to write.
+        categories: See `annotation`.
     """
     if sample.boxes is not None:
         with replacing(root / label_file("detection", split, sample.name)) as part:
-            part.write_text(json.dumps(annotation(sample), separators=(",", ":")), encoding="utf-8")
+            part.write_text(json.dumps(annotation(sample, categories), separators=(",", ":")), encoding="utf-8")
     masks: dict[Task, NDArray[np.uint8] | None] = {"drivable": sample.drivable, "lane": sample.lane}
     for task, mask in masks.items():
         if mask is not None:
@@ -130,18 +162,23 @@ def write_sample(root: Path, split: str, sample: Sample) -> None:
         Image.fromarray(sample.image).save(part, format="JPEG", quality=92)
 
 
-def annotation(sample: Sample) -> dict[str, object]:
-    """Return the sample's boxes as BDD100K's per-image JSON."""
+def annotation(sample: Sample, categories: Sequence[str] = ()) -> dict[str, object]:
+    """Return the sample's boxes as BDD100K's per-image JSON.
+
+    Args:
+        sample: The boxes.
+        categories: The category of each box, then of each ignored one; if left out, all are cars.
+    """
     boxes = np.zeros((0, 4), np.float32) if sample.boxes is None else sample.boxes
     every = [(box, False) for box in boxes] + [(box, True) for box in sample.ignored]
     objects = [
         {
-            "category": "car",
+            "category": category,
             "id": number,
             "attributes": {"crowd": crowd},
             "box2d": {key: round(float(v), 2) for key, v in zip(("x1", "y1", "x2", "y2"), box, strict=True)},
         }
-        for number, (box, crowd) in enumerate(every)
+        for number, ((box, crowd), category) in enumerate(zip(every, categories or ["car"] * len(every), strict=True))
     ]
     return {
         "name": sample.name,

@@ -179,14 +179,15 @@ def _draw_objects(
     things: list[tuple[int, float, Item | VehiclePose | Barrier]] = []
     for vehicle in world.vehicles:
         x, y, angle = course.at(vehicle.s, vehicle.d)
-        if 2.0 < x < FAR * 0.9:
-            things.append((zone(vehicle.d), x, VehiclePose(vehicle, x, y, angle + vehicle.yaw)))
+        pose = VehiclePose(vehicle, x, y, angle + vehicle.yaw)
+        if x < FAR * 0.9 and pose.ground_box[:, 0].max() > 0.0:
+            things.append((zone(vehicle.d), x, pose))
     for item in world.items:
         x, y, _ = course.at(item.s, item.d)
         if 2.5 < x < FAR * 0.9:
             things.append((zone(item.d), x, item))
     for barrier in fences:
-        things.append((zone(barrier.d) + 1, -1.0, barrier))
+        things.append((zone(barrier.d) + 1, -math.inf, barrier))
     things.sort(key=lambda thing: (-thing[0], -thing[1]))
     sun = (
         light.sun * 0.8 * math.cos(light.azimuth),
@@ -208,7 +209,7 @@ def _draw_objects(
             )
             poses.append(thing)
             bright = min(1.0, (light.tone((255.0, 255.0, 255.0), x, thing.y)[0] + 60 * light.lamps) / 90.0)
-            lit.append(math.exp(-light.haze * x) * bright)
+            lit.append(math.exp(-light.haze * max(x, 0.0)) * bright)
         elif isinstance(thing, Barrier):
             draw_barrier(world, thing, image, ids)
         else:

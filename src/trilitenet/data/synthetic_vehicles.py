@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from trilitenet.data.synthetic_world import Colour, Vehicle
 from trilitenet.processing.geometry import Camera
 
-__all__ = ["SHAPES", "SHIFT", "Lamp", "Shape", "VehiclePose", "draw_shadow", "draw_vehicle", "fixed"]
+__all__ = ["SHAPES", "SHIFT", "Lamp", "Shape", "VehiclePose", "draw_shadow", "draw_vehicle", "fixed", "in_front"]
 
 Floats = NDArray[np.float64]
 Surface = Literal["body", "glass", "roof", "dark", "cargo"]
@@ -27,6 +27,10 @@ Tone = Callable[[Colour, float, float], tuple[float, float, float]]
 SHIFT: Final = 4
 """Fractional bits of the coordinates that OpenCV draws at."""
 _LIMIT: Final = 30000.0
+_NEAR: Final = 1.0
+"""Metres from the camera, along its axis, within which nothing of a vehicle is drawn."""
+_MARGIN: Final = 4.0
+"""Pixels beside the picture that vehicles that come nearer are drawn to."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -255,6 +259,36 @@ def fixed(points: Floats) -> NDArray[np.int32]:
     return np.round(np.clip(points, -_LIMIT, _LIMIT) * (1 << SHIFT)).astype(np.int32)
 
 
+def in_front(camera: Camera, points: Floats) -> Floats:
+    """Return the part of a polygon that lies before the camera.
+
+    Args:
+        camera: The camera.
+        points: (N, 3) corners in ego coordinates.
+
+    Returns:
+        (M, 3), empty if nothing of it does.
+    """
+    return _cut(points, (points - (0.0, 0.0, camera.height)) @ camera.rotation[:, 2] - _NEAR)
+
+
+def _cut(points: Floats, side: Floats) -> Floats:
+    """Return the part of a polygon (N, K) on one side of a plane; it may be empty.
+
+    Args:
+        points: Its corners, in coordinates that the plane is straight in.
+        side: (N,) how far each is on the side that stays, in any unit; negative beyond the plane.
+    """
+    gone = side < 0
+    if not gone.any():
+        return points
+    crosses = gone != np.roll(gone, -1)
+    share = side / np.where(crosses, side - np.roll(side, -1), 1.0)
+    cuts = points + share[:, None] * (np.roll(points, -1, axis=0) - points)
+    both = np.stack([points, cuts], axis=1).reshape(-1, points.shape[1])
+    return np.asarray(both[np.stack([~gone, crosses], axis=1).ravel()])
+
+
 def draw_shadow(image: NDArray[np.uint8], camera: Camera, pose: VehiclePose, depth: float) -> None:
     """Darken the road under a vehicle.
 
@@ -264,12 +298,14 @@ def draw_shadow(image: NDArray[np.uint8], camera: Camera, pose: VehiclePose, dep
         pose: The vehicle.
         depth: How dark, in [0, 1].
     """
-    footprint = pose.ground_box
-    if footprint[:, 0].min() < 1.5 or depth <= 0:
+    if depth <= 0:
         return
+    footprint = pose.ground_box
     centre = footprint.mean(axis=0)
     for grow, share in ((1.22, 0.35), (1.05, 0.75)):
-        outline = centre + (footprint - centre) * (1 + (grow - 1) * np.array([0.4, 1.0, 1.0]))
+        outline = in_front(camera, centre + (footprint - centre) * (1 + (grow - 1) * np.array([0.4, 1.0, 1.0])))
+        if not len(outline):
+            return
         pixels = camera.to_pixels(outline)
         low = np.floor(pixels.min(axis=0)).astype(int) - 1
         high = np.ceil(pixels.max(axis=0)).astype(int) + 2
@@ -307,10 +343,14 @@ class _Pen:
 
     def polygon(self, points: Floats, colour: Colour, gain: float = 1.0, *, mark: bool = True) -> None:
         seen = points @ self.matrix[:3] + self.matrix[3]
-        depth = seen[:, 2]
-        if depth.min() < 0.3:
-            return
-        outline = (np.clip(seen[:, :2] / depth[:, None], -_LIMIT, _LIMIT) * (1 << SHIFT) + 0.5).astype(np.int32)
+        if seen[:, 2].min() < _NEAR:
+            seen = _cut(seen, seen[:, 2] - _NEAR)
+            # Of an edge that goes far beside the picture OpenCV misplaces what is within.
+            seen = _cut(seen, seen[:, 0] + _MARGIN * seen[:, 2])
+            seen = _cut(seen, (self.image.shape[1] + _MARGIN) * seen[:, 2] - seen[:, 0])
+            if not len(seen):
+                return
+        outline = (np.clip(seen[:, :2] / seen[:, 2:], -_LIMIT, _LIMIT) * (1 << SHIFT) + 0.5).astype(np.int32)
         shade = tuple(b + g * c * gain for b, g, c in zip(self.base, self.gain, colour, strict=True))
         cv2.fillPoly(self.image, [outline], shade, cv2.LINE_AA, SHIFT)
         if mark:
@@ -351,8 +391,8 @@ def draw_vehicle(
         Lights whose glare is still to be added.
     """
     shape, vehicle = pose.shape, pose.vehicle
-    footprint = pose.ground_box
-    if footprint[:, 0].min() < 0.5:
+    footprint = in_front(camera, pose.ground_box)
+    if not len(footprint):
         return []
     pixels = camera.to_pixels(footprint)
     span = float(np.ptp(pixels[:, 0]))
