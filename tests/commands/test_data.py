@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import errno
 import json
 import math
@@ -32,6 +33,7 @@ from trilitenet.data.prepared import PreparedDataset, open_dataset
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.recipe import TrainConfig
 from trilitenet.errors import ConfigError, DataError, OutputError
+from trilitenet.formats.readers.mapping import LabelMapping
 
 
 @pytest.fixture
@@ -179,6 +181,31 @@ def test_what_missing_labels_mean_is_refused_where_files_tell_it(raw: Path, tmp_
     (tmp_path / "classes.yaml").write_text("missing: empty\n")
     with pytest.raises(ConfigError, match=f"'missing' .* is for coco, yolo and cvat; leave it out for {kind}"):
         convert(str(raw), tmp_path / "out", kind=kind, classes=tmp_path / "classes.yaml")
+
+
+@pytest.mark.parametrize(
+    ("line", "kinds"),
+    [
+        ("tasks: [detection]", "coco, yolo, cvat and masks"),
+        ("drivable: [road]", "coco, yolo and cvat"),
+        ("lane_edges: true", "cvat"),
+        ("split: val", "coco, cvat and masks"),
+        ("images: frames", "masks"),
+    ],
+)
+def test_a_key_that_bdd100k_does_not_take_is_refused(raw: Path, tmp_path: Path, line: str, kinds: str) -> None:
+    classes = tmp_path / "classes.yaml"
+    classes.write_text(f"{line}\nname: ours\n")
+    key = line.partition(":")[0]
+    with pytest.raises(
+        ConfigError, match=f"^'{key}' in the file of --classes is for {kinds}; leave it out for bdd100k$"
+    ):
+        convert("bdd100k", raw, tmp_path / "out", classes=classes)
+
+
+def test_every_key_of_the_file_of_classes_is_taken_or_refused() -> None:
+    taken = {"classes", "ignore", "name", "licence"}
+    assert {field.name for field in dataclasses.fields(LabelMapping)} - taken == command._KEYS.keys()
 
 
 def test_convert_wants_its_words(raw: Path, tmp_path: Path) -> None:

@@ -291,6 +291,50 @@ def test_described_values_are_expected(root: Path) -> None:
     assert check_dataset(root).ok
 
 
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_masks_of_16_bits_are_refused_as_by_training(root: Path, channels: int) -> None:
+    draw_mask(root, np.full((72, 128, channels), 65535, np.uint16))
+    (finding,) = check_dataset(root).findings
+    assert finding.kind == "mask-values"
+    assert finding.examples == ("da_seg_annotations/train/train_0000.png: has 16 bits a pixel; save it with 8",)
+    with pytest.raises(DataError, match="has 16 bits a pixel; save it with 8"):
+        DrivingDataset(root, "train")[0]
+
+
+@pytest.mark.parametrize("colour", [(244, 35, 232), (0, 255, 0), (128, 64, 128)])
+def test_the_value_of_a_colour_is_that_of_training(root: Path, colour: tuple[int, int, int]) -> None:
+    draw_mask(root, np.full((72, 128, 3), colour[::-1], np.uint8))
+    (finding,) = check_dataset(root).findings
+    value = finding.examples[0].split()[-1]
+    (root / "dataset.yaml").write_text(f"drivable: {{ignore: [{value}]}}\n")
+    assert check_dataset(root).ok
+    valid = DrivingDataset(root, "train")[0].drivable_valid
+    assert valid is not None
+    assert not valid.any()
+
+
+@pytest.mark.parametrize(
+    ("meaning", "values", "found"),
+    [
+        ("{above: 127, ignore: [64]}", (0, 64), set()),
+        ("{above: 127, values: {255: road, 64: pavement}}", (0, 64), set()),
+        ("{above: 127, values: {255: road}}", (0, 64), {"mask-invisible"}),
+        ("{above: 127, values: {255: road}, ignore: [64]}", (0, 32, 64), {"mask-invisible"}),
+        ("{above: 127, values: {255: road, 64: pavement}}", (0, 32, 255), {"mask-values"}),
+        ("{values: {1: drivable}}", (0, 1), {"mask-invisible"}),
+        ("{values: {1: drivable, 255: unclear}, ignore: [255]}", (0, 1, 255), {"mask-invisible"}),
+    ],
+)
+def test_labels_that_are_meant_as_background_are_not_invisible(
+    root: Path, meaning: str, values: tuple[int, ...], found: set[str]
+) -> None:
+    (root / "dataset.yaml").write_text(f"drivable: {meaning}\n")
+    for path in root.glob("da_seg_annotations/*/*.png"):
+        path.unlink()
+    draw_mask(root, np.resize(np.array(values, np.uint8), (72, 128)))
+    assert kinds(check_dataset(root)) == found
+
+
 @pytest.mark.parametrize(
     ("target", "reason"),
     [

@@ -83,6 +83,8 @@ def test_attributes_tasks_and_missing_labels(root: Path, tmp_path: Path) -> None
         assert lanes[0].boxes is None
         assert lanes[0].drivable is None
         assert lanes[0].lane is not None
+        assert lanes[1].drivable_valid is None
+        assert lanes[2].lane_valid is not None
         assert not any(len(sample.ignored) for sample in lanes)
 
 

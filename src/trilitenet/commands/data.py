@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Final, Literal, get_args
 
 import cv2
 from cyclopts import Parameter
@@ -41,6 +41,23 @@ from trilitenet.processing.letterbox import Letterbox
 __all__ = ["Checked", "Converted", "Prepared", "Shown", "check", "convert", "prepare", "show"]
 
 Kind = Literal["bdd100k", "coco", "yolo", "cvat", "masks"]
+
+_KEYS: Final = {
+    "missing": "coco, yolo and cvat",
+    "drivable": "coco, yolo and cvat",
+    "alternative": "coco, yolo and cvat",
+    "lane": "coco, yolo and cvat",
+    "lane_edges": "cvat",
+    "tasks": "coco, yolo, cvat and masks",
+    "split": "coco, cvat and masks",
+    "splits": "masks",
+    "images": "masks",
+    "drivable_mask": "masks",
+    "lane_mask": "masks",
+}
+"""Keys of the file of --classes that some formats do not take -> those that do."""
+_REFUSED: Final[dict[str, Collection[str]]] = {"bdd100k": _KEYS.keys(), "masks": ("missing",)}
+"""Without effect, they would be taken for heard."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -288,8 +305,8 @@ def show(
         count: How many images a split.
         start: Leave out the first so many: the next sheet of the same seed.
         seed: Of the random order.
-        columns: Images a row of a contact sheet.
-        width: Of each image in pixels.
+        columns: Images a row of a contact sheet; a page takes as many as fit.
+        width: Of each image in pixels; on a page at least 480.
 
     Raises:
         DataError: If there is no such split, or no such image.
@@ -434,8 +451,10 @@ def _arguments(source: str, output: StrPath, target: StrPath | None, kind: str |
 
 
 def _open_source(kind: str, raw: str, mapping: LabelMapping, options: ConversionOptions) -> RecordSource:
-    if mapping.missing is not None and kind in {"bdd100k", "masks"}:
-        raise ConfigError(f"'missing' in the file of --classes is for coco, yolo and cvat; leave it out for {kind}")
+    default = LabelMapping()
+    for key, kinds in _KEYS.items():
+        if key in _REFUSED.get(kind, ()) and getattr(mapping, key) != getattr(default, key):
+            raise ConfigError(f"{key!r} in the file of --classes is for {kinds}; leave it out for {kind}")
     if kind == "bdd100k":
         return read_bdd100k(raw, crosswalk=options.crosswalk, vertical=options.vertical)
     readers: dict[str, Callable[[str, LabelMapping], RecordSource]] = {

@@ -29,6 +29,7 @@ from trilitenet.data.reading import (
     IMAGE_FOLDER,
     LABEL_FILES,
     check_root,
+    decode_grey,
     decode_mask,
     is_crowd,
     is_image_file,
@@ -450,27 +451,44 @@ def _look_at_mask(
 ) -> float | None:
     """Return the part of the mask that is foreground."""
     try:
-        with open_image(path) as picture:
-            picture.load()
+        data = path.read_bytes()
+        with open_image(io.BytesIO(data)) as picture:
+            picture.load()  # which OpenCV does not refuse if it is cut short
+            found = upright_size(picture)
     except BROKEN as error:
         faults.append(("mask-unreadable", f"{where} ({_reason(error)})"))
         return None
-    found = (picture.height, picture.width)
     if size is not None and found != size:
         faults.append(("mask-size", f"{where} is {found[1]}x{found[0]}, its image {size[1]}x{size[0]}"))
-    if picture.mode.startswith("I"):
-        faults.append(("mask-values", f"{where} has 16 bits a pixel; save it with 8"))
+    try:
+        grey = decode_grey(np.frombuffer(data, np.uint8), where)  # as training does: Pillow's grey of colours differs
+    except DataError as error:
+        faults.append(("mask-values", str(error)))
         return None
-    counts = np.array(picture.convert("L").histogram())
+    if grey is None:
+        faults.append(("mask-unreadable", f"{where} (cannot be decoded)"))
+        return None
+    counts = np.bincount(grey.ravel(), minlength=256)
     present = set(np.flatnonzero(counts).tolist())
     allowed = {0, *meaning.values, *meaning.ignore} if meaning.values else {*_PLAIN_VALUES, *meaning.ignore}
-    if present - {0} and max(present) <= meaning.above:
+    if _is_invisible(present, meaning):
         faults.append(("mask-invisible", f"{where} has {_listed(present)}; foreground is above {meaning.above}"))
     elif present - allowed:
         faults.append(("mask-values", f"{where} has {_listed(present - allowed)}"))
     levels = np.arange(256)
     foreground = (levels > meaning.above) & ~np.isin(levels, meaning.ignore)
     return float(counts[foreground].sum() / counts.sum())
+
+
+def _is_invisible(present: set[int], meaning: MaskMeaning) -> bool:
+    """Return whether a mask has labels, all at or below the threshold, and ``dataset.yaml`` does not explain them.
+
+    ``values`` that names none above the threshold explains nothing: one of the two is a slip.
+    """
+    labels = present - {0, *meaning.ignore}
+    named = {*meaning.values} - {*meaning.ignore}
+    hidden = labels - named if any(value > meaning.above for value in named) else labels
+    return bool(hidden) and max(labels) <= meaning.above
 
 
 def _find_classes(job: _Job, facts: dict[str, list[_Facts]], collector: _Collector) -> None:

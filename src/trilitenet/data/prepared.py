@@ -375,7 +375,8 @@ class PreparedDataset:
         masks: dict[str, NDArray[np.uint8] | None] = {}
         for key in (*MASKS, *VALID):
             packed = parts.get(f"{key}.npy")
-            if packed is None or (key in MASKS and self._tasks is not None and key not in self._tasks):
+            task = key.removesuffix("_valid")
+            if packed is None or (task in MASKS and self._tasks is not None and task not in self._tasks):
                 masks[key] = None
             else:
                 masks[key] = np.unpackbits(packed.reshape(height, -1), axis=1, count=width)

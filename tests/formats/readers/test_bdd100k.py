@@ -13,6 +13,7 @@ import pytest
 from tests.formats.readers import raw_bdd
 from trilitenet.data.converting import ConversionOptions, convert
 from trilitenet.data.reading import DrivingDataset
+from trilitenet.data.records import MaskFile
 from trilitenet.errors import DataError
 from trilitenet.formats.readers import bdd100k
 from trilitenet.formats.readers.bdd100k import parse_labels, read_bdd100k
@@ -329,6 +330,75 @@ def test_the_later_of_two_releases_is_read(tmp_path: Path) -> None:
     assert [item.category for item in objects] == ["bus"]
 
 
+def test_a_file_that_is_passed_over_for_another_is_told(tmp_path: Path) -> None:
+    raw_bdd.write_images(tmp_path)
+    for release in ("det_19", "det_20"):
+        write_entries(tmp_path / f"labels/{release}/det_train.json", [{"name": "a1.jpg", "labels": []}])
+    told = "of several files of one kind, labels/det_20/det_train.json is read, not labels/det_19/det_train.json"
+    assert f"train: {told}" in read_bdd100k(tmp_path).found
+
+
+def shapeless(category: str) -> dict[str, Any]:
+    return {"category": category, "rle": {"counts": "abc", "size": [*raw_bdd.SIZE]}}
+
+
+def test_run_lengths_beside_polygons_do_not_disturb(tmp_path: Path) -> None:
+    raw_bdd.write_images(tmp_path)
+    raw_bdd.write_2020(tmp_path)
+    before = read_bdd100k(tmp_path)
+    for folder, name, category in (
+        ("drivable/rles", "drivable", "direct"),
+        ("lane/rles", "lane", "single white"),
+        ("det_20/rles", "det", "car"),
+        ("ins_seg/polygons", "ins_seg", "car"),
+        ("pan_seg/polygons", "pan_seg", "road"),
+    ):
+        entry = {"name": "a1.jpg", "labels": [shapeless(category)]}
+        write_entries(tmp_path / f"labels/{folder}/{name}_train.json", [entry])
+    source = read_bdd100k(tmp_path)
+    assert source.found[:-1] == before.found
+    assert source.found[-1].startswith("not read (")
+    record = source.record("train", "a1")
+    assert record.objects
+    assert isinstance(record.drivable, tuple)
+    assert len(record.drivable) == 2
+    assert record.lane
+    assert not record.dropped
+
+
+@pytest.mark.parametrize("form", ["one file a task", "one file for all", "one file an image"])
+def test_labels_without_a_shape_are_no_empty_ones(tmp_path: Path, form: str) -> None:
+    raw_bdd.write_images(tmp_path)
+    raw_bdd.write_2020(tmp_path, polygons=False, masks="ids 2020")
+    (tmp_path / "labels/det_20/det_train.json").unlink()
+    labels = [shapeless("car"), shapeless("direct"), shapeless("single white")]
+    entry = {"name": "a1.jpg", "labels": labels}
+    if form == "one file a task":
+        for name, label in zip(("det_20/det", "drivable/drivable", "lane/lane"), labels, strict=True):
+            write_entries(tmp_path / f"labels/{name}_train.json", [{**entry, "labels": [label]}])
+    elif form == "one file for all":
+        write_entries(tmp_path / "labels/bdd100k_labels_images_train.json", [entry, {"name": "a2.jpg", "labels": []}])
+    else:
+        folder = tmp_path / "labels/100k/train"
+        folder.mkdir(parents=True)
+        for name, objects in (("a1", labels), ("a2", [])):
+            (folder / f"{name}.json").write_text(json.dumps({"name": name, "frames": [{"objects": objects}]}))
+    source = read_bdd100k(tmp_path)
+    record, other = (source.record("train", name) for name in ("a1", "a2"))
+    assert (record.objects, record.lane) == (None, None)
+    assert isinstance(record.drivable, MaskFile)
+    assert sum(record.dropped.values()) == 3
+    assert (other.objects, other.drivable, other.lane) == (None, None, None)
+
+
+def test_one_label_without_a_shape_leaves_the_others(tmp_path: Path) -> None:
+    unknown = {"category": "area/unknown"}
+    record = parse_labels({"labels": [AREA, shapeless("direct"), unknown]}, Path("x.jpg"), "x.json")
+    assert len(record.drivable or ()) == 1  # type: ignore[arg-type]
+    assert record.objects == ()
+    assert parse_labels({"labels": [unknown]}, Path("x.jpg"), "x.json").drivable == ()
+
+
 def test_documents_are_of_all_the_tasks_that_any_of_them_has(tmp_path: Path) -> None:
     raw_bdd.write_images(tmp_path)
     box = {"category": "car", "box2d": {"x1": 1, "y1": 2, "x2": 9, "y2": 9}}
@@ -369,6 +439,14 @@ def test_pictures_among_the_labels_are_no_images(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "labels" / "train" / "a1.jpg"), np.zeros((9, 9, 3), np.uint8))
     with pytest.raises(DataError, match="no BDD100K images"):
         read_bdd100k(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "place", ["labelled/bdd100k/images/100k", "my_labels/images/100k", "labelled/100k", "labelled"]
+)
+def test_images_may_be_in_a_folder_called_labelled(tmp_path: Path, place: str) -> None:
+    raw_bdd.write_images(tmp_path, prefix=place)
+    assert read_bdd100k(tmp_path).names("train") == ["a1", "a2"]
 
 
 def test_hidden_files_are_passed_over(tmp_path: Path) -> None:

@@ -301,6 +301,26 @@ def test_images_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> N
     assert [len(source.record("train", name).objects or ()) for name in source.names("train")] == [5, 0]
 
 
+@pytest.mark.parametrize("split", ["train", "val"])
+def test_a_picture_is_not_that_of_another_image_of_its_name(tmp_path: Path, split: str) -> None:
+    (image,) = coco()["images"]
+    for file, name in (("train_a", "monday/one.png"), (f"{split}_b", "tuesday/one.png")):
+        write(tmp_path / f"annotations/instances_{file}.json", coco(images=[{**image, "file_name": name}]))
+    write(tmp_path / "images/one.png")
+    with pytest.raises(
+        DataError, match=r"one\.png: is the only picture of both 'monday/one\.png' and 'tuesday/one\.png'"
+    ):
+        read_coco(tmp_path)
+
+
+def test_several_files_may_list_one_image(tmp_path: Path) -> None:
+    (image,) = coco()["images"]
+    for split, name in (("train", "one.png"), ("val", "./one.png")):
+        write(tmp_path / f"annotations/instances_{split}.json", coco(images=[{**image, "file_name": name}]))
+    write(tmp_path / "images/one.png")
+    assert read_coco(tmp_path).splits == ("train", "val")
+
+
 def test_subsets_as_cvat_and_datumaro_export_them(tmp_path: Path) -> None:
     for subset in ("default", "Rear"):
         write(tmp_path / "images" / subset / "one.png")

@@ -202,6 +202,17 @@ def test_images_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> N
     assert read_cvat(tmp_path, LabelMapping(drivable=("road",))).names("train") == ["monday-one", "tuesday-one"]
 
 
+def test_a_picture_is_not_that_of_another_image_of_its_name(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "one.png"), np.zeros((*SIZE, 3), np.uint8))
+    for name, subset in (("monday/one.png", "train"), ("tuesday/one.png", "val")):
+        image = f'<image name="{name}" subset="{subset}" width="80" height="48"><tag label="road"/></image>'
+        (tmp_path / f"{subset}.xml").write_text(f"<annotations>{image}</annotations>")
+    with pytest.raises(
+        DataError, match=r"one\.png: is the only picture of both 'monday/one\.png' and 'tuesday/one\.png'"
+    ):
+        read_cvat(tmp_path, LabelMapping(drivable=("road",)))
+
+
 def test_a_project_as_cvat_exports_it(tmp_path: Path) -> None:
     """Pictures are in a folder a subset, called as in CVAT, and frames of a video are named without their ending."""
     lines = []

@@ -66,6 +66,8 @@ _AREA_KINDS: Final = {
 }
 _DOCUMENTS_LOOKED_AT: Final = 300
 _CHUNK = 1 << 24
+_LABELS: Final = re.compile(r"labels?(?![a-z])")
+"""In the path of a folder of labels, whose pictures are no images; a folder of ``labelled`` ones is none."""
 _SKIPPED_AREAS: Final = {"area/unknown", "unknown", "background", "area/background"}
 
 
@@ -169,7 +171,7 @@ def read_bdd100k(raw: str | Path, *, crosswalk: bool = False, vertical: bool = F
         if not images:
             continue
         documents = _first(folders, rf"labels/100k/{split}", rf"labels/{split}", rf"100k/{split}", ending=".json")
-        merged = _merged_files(files, split)
+        merged, passed_over = _merged_files(files, split)
         parts: dict[str, list[_Part]] = {}
         tasks: dict[Path, frozenset[Task]] = {}
         for path in merged:
@@ -189,6 +191,9 @@ def read_bdd100k(raw: str | Path, *, crosswalk: bool = False, vertical: bool = F
         sources = [f"{path.relative_to(root)} ({', '.join(sorted(tasks[path])) or 'nothing'})" for path in tasks]
         sources += [f"{path.relative_to(root)} (masks)" for path in (drivable and drivable[0], lane) if path]
         found.append(f"{split}: {len(images)} images; labels from {', '.join(sources) or 'nowhere'}")
+        for path, unread in passed_over.items():
+            rest = few([str(other.relative_to(root)) for other in unread])
+            found.append(f"{split}: of several files of one kind, {path.relative_to(root)} is read, not {rest}")
     if not splits:
         raise DataError(
             f"{root}: no BDD100K images; looked for folders images/100k/{{train,val,test}} (or images/train, ...) with "
@@ -208,7 +213,8 @@ def parse_labels(content: Any, image: Path, source: str, tasks: Collection[Task]
         content: The parsed JSON.
         image: The image's file.
         source: Where it came from, for messages.
-        tasks: What the file labels: an entry without objects of these is labelled, with nothing in it.
+        tasks: What the file labels: an entry without objects of these is labelled, with nothing in it; one whose
+            labels of a task are all without a shape is not labelled for that task.
 
     Raises:
         DataError: If it is neither form.
@@ -218,13 +224,20 @@ def parse_labels(content: Any, image: Path, source: str, tasks: Collection[Task]
     if content.get("frames") is None and not {"labels", "name"} & content.keys():
         raise DataError(f"{source}: neither 'frames' (2018, one file an image) nor 'labels' (Scalabel) in the entry")
     labels = Labels()
+    shapeless: set[Task] = set()
     try:
         for item in _items(content):
-            _parse_item(item, labels)
+            if not _parse_item(item, labels):
+                shapeless |= _task_of(str(item["category"]))
         labels.attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise DataError(f"{source}: {image.stem}: {brief(error)} is not as BDD100K has it") from error
-    return labels.record(image.stem, image, tasks)
+    read: dict[Task, bool] = {
+        "detection": bool(labels.objects),
+        "drivable": bool(labels.areas),
+        "lane": bool(labels.lanes),
+    }
+    return labels.record(image.stem, image, [task for task in tasks if read[task] or task not in shapeless])
 
 
 def _items(content: Mapping[str, Any]) -> list[Any]:
@@ -235,7 +248,8 @@ def _items(content: Mapping[str, Any]) -> list[Any]:
     return [*(content.get("labels") or ())]
 
 
-def _parse_item(item: dict[str, Any], labels: Labels) -> None:
+def _parse_item(item: dict[str, Any], labels: Labels) -> bool:
+    """Add a label; return whether it has a shape."""
     category = str(item["category"])
     attributes = item.get("attributes") or {}
     if item.get("box2d") is not None:
@@ -248,7 +262,7 @@ def _parse_item(item: dict[str, Any], labels: Labels) -> None:
         kind = _area_kind(category, attributes)
         if kind is None and not _is_lane(category):
             labels.dropped[f"polygon of category {category!r}"] += 1
-            return
+            return True
         for vertices, types, closed in _polygons(item["poly2d"], closed=kind is not None):
             if len(vertices) < (3 if closed else 2):
                 labels.dropped[f"{'area' if kind else 'lane'} with too few points"] += 1
@@ -270,6 +284,8 @@ def _parse_item(item: dict[str, Any], labels: Labels) -> None:
             )
     else:
         labels.dropped[f"label without shape of category {category!r}"] += 1
+        return False
+    return True
 
 
 def _area_kind(category: str, attributes: Mapping[str, Any]) -> str | None:
@@ -342,14 +358,20 @@ def _tasks_in(entry: Any) -> set[Task]:
     except (TypeError, AttributeError):
         return tasks
     for item in items:
-        category = str(item.get("category"))
         if item.get("box2d") is not None:
             tasks.add("detection")
-        elif category == "drivable area" or category in _AREA_KINDS:
-            tasks.add("drivable")
-        elif _is_lane(category):
-            tasks.add("lane")
+        elif item.get("poly2d"):
+            tasks |= _task_of(str(item.get("category"))) - {"detection"}
     return tasks
+
+
+def _task_of(category: str) -> set[Task]:
+    """Return the task that labels of a category are of; none for areas that nobody drives on."""
+    if category == "drivable area" or category in _AREA_KINDS:
+        return {"drivable"}
+    if _is_lane(category):
+        return {"lane"}
+    return set() if category in _SKIPPED_AREAS else {"detection"}
 
 
 def _tasks_of_documents(folder: Path) -> frozenset[Task]:
@@ -371,8 +393,11 @@ def _is_lane(category: str) -> bool:
     return category == "lane" or category.startswith("lane/") or category in _LANE_CATEGORIES
 
 
-def _merged_files(files: list[Path], split: str) -> list[Path]:
-    """Return the files of a whole split, the newest generation first."""
+def _merged_files(files: list[Path], split: str) -> tuple[list[Path], dict[Path, list[Path]]]:
+    """Return the files of a whole split, the newest generation first, and those that each is read instead of.
+
+    Files in ``rles`` hold the masks once more, without polygons.
+    """
     patterns = (
         rf"(^|/)det_{split}\.json$",
         rf"(^|/)drivable_{split}\.json$",
@@ -381,11 +406,14 @@ def _merged_files(files: list[Path], split: str) -> list[Path]:
         rf"(^|/)bdd100k_labels_images_{split}_100k\.json$",
     )
     found = []
+    passed_over: dict[Path, list[Path]] = {}
     for pattern in patterns:
-        matching = sorted(path for path in files if re.search(pattern, path.as_posix()))
+        matching = sorted(path for path in files if re.search(pattern, path.as_posix()) and path.parent.name != "rles")
         if matching:
             found.append(matching[-1])
-    return found
+        if matching[1:]:
+            passed_over[matching[-1]] = matching[:-1]
+    return found, passed_over
 
 
 def _index(path: Path) -> Iterator[tuple[str, _Part, dict[str, Any]]]:
@@ -462,7 +490,8 @@ def _images(folders: dict[str, Path], split: str) -> dict[str, Path]:
     for pattern in (f"images/100k/{split}", f"100k/{split}", f"images/{split}", split):
         images: dict[str, Path] = {}
         for where, folder in folders.items():
-            if re.search(rf"(^|/){pattern}$", where) and "label" not in where:
+            match = re.search(rf"(^|/){pattern}$", where)
+            if match and (pattern.startswith("images/") or not _LABELS.search(where[: match.start()])):
                 for path in visible(folder.iterdir()):
                     if path.suffix.lower() in IMAGE_ENDINGS[:2]:
                         first = images.setdefault(path.stem, path)

@@ -41,20 +41,21 @@ def read_coco(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
         mapping: What the categories mean.
 
     Raises:
-        DataError: If there is no annotation file, or a broken one, or one whose annotations are of no image in it; or
-            if the categories mean nothing.
+        DataError: If there is no annotation file, or a broken one, or one whose annotations are of no image in it; if
+            one picture would be that of two images; or if the categories mean nothing.
     """
     mapping = mapping or LabelMapping()
     root = Path(root)
     records: dict[str, list[ImageRecord]] = defaultdict(list)
     found = []
     categories: set[str] = set()
+    taken: dict[Path, str] = {}
     folders = [root if root.is_dir() else root.parent]
     if root.is_file() and folders[0].resolve().name == "annotations":
         folders.append(folders[0].resolve().parent)
     chosen, unused = _annotation_files(root, mapping.split)
     for path, split, content in chosen:
-        items, missing, stray = _read_file(content, path, split, folders, mapping, categories)
+        items, missing, stray = _read_file(content, path, split, folders, mapping, categories, taken)
         records[split] += items
         found.append(f"{split}: {len(items)} images of {path.name}; {missing} more are not there")
         if stray:
@@ -110,11 +111,17 @@ def _split_of(path: Path, default: str) -> str:
 
 
 def _read_file(
-    content: Any, path: Path, split: str, roots: list[Path], mapping: LabelMapping, categories: set[str]
+    content: Any,
+    path: Path,
+    split: str,
+    roots: list[Path],
+    mapping: LabelMapping,
+    categories: set[str],
+    taken: dict[Path, str],
 ) -> tuple[list[ImageRecord], int, int]:
     """Return the images, how many more are not there, and how many annotations are of no image that is listed.
 
-    What its categories are called is added to ``categories``.
+    What its categories are called is added to ``categories``, and its images' files and names to ``taken``.
     """
     try:
         names = {item["id"]: str(item["name"]) for item in content.get("categories", ())}
@@ -147,7 +154,7 @@ def _read_file(
         records: list[ImageRecord] = []
         missing = 0
         for image in content["images"]:
-            place = find_image(str(image["file_name"]), folders)
+            place = find_image(str(image["file_name"]), folders, taken)
             if place is None:
                 missing += 1
                 continue

@@ -54,7 +54,8 @@ def read_cvat(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
         mapping: What the labels mean.
 
     Raises:
-        DataError: If there is no such file, a broken one, or one of videos; or if the labels mean nothing.
+        DataError: If there is no such file, a broken one, or one of videos; if one picture would be that of two
+            images; or if the labels mean nothing.
     """
     mapping = mapping or LabelMapping()
     root = Path(root)
@@ -65,10 +66,11 @@ def read_cvat(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
     folder = root.parent if root.is_file() else root
     records: dict[str, list[ImageRecord]] = defaultdict(list)
     categories: set[str] = set()
+    taken: dict[Path, str] = {}
     missing = videos = 0
     for path in files:
         try:
-            missing += _read_file(path, folder, mapping, records, categories)
+            missing += _read_file(path, folder, mapping, records, categories, taken)
         except _OfVideoError:
             videos += 1
             if videos == len(files):
@@ -87,9 +89,17 @@ def read_cvat(root: str | Path, mapping: LabelMapping | None = None) -> ListedRe
 
 
 def _read_file(
-    path: Path, folder: Path, mapping: LabelMapping, records: dict[str, list[ImageRecord]], every: set[str]
+    path: Path,
+    folder: Path,
+    mapping: LabelMapping,
+    records: dict[str, list[ImageRecord]],
+    every: set[str],
+    taken: dict[Path, str],
 ) -> int:
-    """Add a file's images to ``records`` and its labels' names to ``every``; return how many images are not there."""
+    """Return how many images are not there.
+
+    The others are added to ``records``, their files and names to ``taken``, and the labels' names to ``every``.
+    """
     categories: set[str] = set()
     images: list[ElementTree.Element] = []
     try:
@@ -116,7 +126,8 @@ def _read_file(
         own = "" if subset.lower() == _NO_SUBSET else subset.lower()
         split = SPLIT_NAMES.get(own, own or mapping.split)
         tops = [folder, folder / "images"]
-        place = find_image(name, [*tops, *(top / part for part in (split, subset) for top in tops), folder / "data"])
+        folders = [*tops, *(top / part for part in (split, subset) for top in tops), folder / "data"]
+        place = find_image(name, folders, taken)
         if place is None:
             missing += 1
             continue

@@ -8,7 +8,7 @@ import itertools
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -288,12 +288,33 @@ def visible(files: Iterable[Path]) -> list[Path]:
     return sorted(path for path in files if not path.name.startswith("."))
 
 
-def find_image(name: str, folders: list[Path]) -> Path | None:
+def find_image(name: str, folders: list[Path], taken: dict[Path, str]) -> Path | None:
     """Return the first of the folders' files with that name, or with its last part.
 
     A name without the ending of an image, as CVAT gives the frames of a video, is that of a file with any of them.
+
+    Args:
+        name: As it is listed.
+        folders: Where to look, in this order.
+        taken: Files that were found for other names, of any split -> the name; what is found is added.
+
+    Raises:
+        DataError: If the file was found for another name: one of the two has no picture.
     """
-    posix = name.replace("\\", "/")  # as written on Windows, whose archives may have made files of such names here
+    place = _first_file(name, folders)
+    if place is not None:
+        first = taken.setdefault(place, name)
+        if PurePosixPath(_posix(first)) != PurePosixPath(_posix(name)):
+            raise DataError(f"{place}: is the only picture of both {first!r} and {name!r}; keep them in their folders")
+    return place
+
+
+def _posix(name: str) -> str:
+    return name.replace("\\", "/")
+
+
+def _first_file(name: str, folders: list[Path]) -> Path | None:
+    posix = _posix(name)  # as written on Windows, whose archives may have made files of such names here
     endings = [""]
     if Path(name).suffix.lower() not in IMAGE_ENDINGS:
         endings += [*IMAGE_ENDINGS, *map(str.upper, IMAGE_ENDINGS)]
