@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import io
@@ -24,8 +25,8 @@ import torch
 import yaml
 
 import trilitenet
-from trilitenet.commands.train import _display, build_loss, train, training_data, validation_figures
-from trilitenet.commands.train_table import train_table
+from trilitenet.commands.train import _display, _nested, build_loss, train, training_data, validation_figures
+from trilitenet.commands.train_table import TableResult, train_table
 from trilitenet.config import DEFAULT_ANCHORS, TASKS, Task
 from trilitenet.data.description import read_description, write_description
 from trilitenet.data.loader import epoch_order
@@ -163,6 +164,26 @@ def test_resume_is_bit_for_bit_with_validation_between(scenes: Path, tmp_path: P
     same(state(straight.folder), state(tmp_path))
 
 
+def test_a_setting_may_be_a_path_one_for_several_or_none(tmp_path: Path) -> None:
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text("samples_per_epoch: 2\nteacher: tiny\nepochs: 7\n")
+    given = {
+        "data": tmp_path,
+        "extra_data": {tmp_path / "more": 1.0},
+        "tasks": "lane",
+        "loggers": "csv",
+        "freeze": "encoder",
+        "samples_per_epoch": None,
+        "teacher": None,
+        "epochs": None,
+        "augmentation__flip": None,
+    }
+    config = read_recipe(recipe, _nested(given))
+    assert (config.data, config.extra_data) == (str(tmp_path), {str(tmp_path / "more"): 1.0})
+    assert (config.tasks, config.loggers, config.freeze) == (("lane",), ("csv",), ("encoder",))
+    assert (config.samples_per_epoch, config.teacher, config.epochs) == (None, None, 7)
+
+
 def test_initial_weights_keep_their_anchors(scenes: Path, tmp_path: Path) -> None:
     train(**settings(scenes, tmp_path, init="tiny", max_steps=1, auto_anchor=True, anchor_recall=0.0))
     assert load_network(tmp_path / "final.safetensors").card.anchors == load_network("tiny").card.anchors
@@ -214,7 +235,8 @@ def test_what_has_no_effect_is_told(scenes: Path, tmp_path: Path, caplog: pytest
     data = shutil.copytree(scenes, tmp_path / "data")
     shutil.rmtree(data / "ll_seg_annotations" / "train")
     more: dict[str, Any] = {"classes": ("vehicel",), "sampling": {"timeofdy": {"night": 2.0}}}
-    train(**settings(data, tmp_path / "run", max_steps=1, swapped_anchors=True, patience=2, **more))
+    train(**settings(data, tmp_path / "run", max_steps=1, swapped_anchors=True, patience=2, warmup_epochs=0.0, **more))
+    assert "warmup_steps changes nothing where warmup_epochs is 0" in caplog.text
     assert "swapped_anchors changes nothing without auto_anchor" in caplog.text
     assert "patience stops nothing without val_split" in caplog.text
     assert "no image of train is labelled for lane" in caplog.text
@@ -1024,6 +1046,93 @@ def test_a_table_is_trained_once_and_printed(scenes: Path, tmp_path: Path) -> No
         train_table(table, **moved)
 
 
+@pytest.fixture
+def table(scenes: Path, tmp_path: Path) -> Callable[..., TableResult]:
+    """Return what trains a table of one row, of at most six steps, two an epoch."""
+    pytest.importorskip("matplotlib")
+    (tmp_path / "a.yaml").write_text("tasks: [drivable]\n")
+    (tmp_path / "t.yaml").write_text("title: Parts\nrows: {All: a.yaml}\n")
+
+    def run(*, resume: bool = False, **more: Any) -> TableResult:
+        plain = settings(scenes, tmp_path, **{"epochs": 3, **more})
+        plain = {key: list(value) if isinstance(value, tuple) else value for key, value in plain.items()}
+        del plain["data"], plain["output"]
+        text = yaml.safe_dump(plain)
+        return train_table(tmp_path / "t.yaml", data=scenes, output=tmp_path / "runs", resume=resume, settings=text)
+
+    return run
+
+
+@pytest.fixture
+def stopped(table: Callable[..., TableResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder of the table's row, stopped after three steps."""
+    with stopping_at(3, monkeypatch):
+        assert not table().finished
+    return tmp_path / "runs" / "a"
+
+
+@contextlib.contextmanager
+def stopping_at(step: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Ask runs to stop in one of their steps, counted from 1."""
+    plain = Trainer._train_step
+
+    def train_step(self: Trainer, batches: Any) -> Any:
+        if self.step == step - 1:
+            os.kill(os.getpid(), signal.SIGINT)
+        return plain(self, batches)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "_train_step", train_step)
+        yield
+
+
+def test_a_row_that_was_stopped_is_never_trained_anew_unasked(
+    table: Callable[..., TableResult], stopped: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[int] = []
+    plain = Trainer._train_step
+    monkeypatch.setattr(Trainer, "_train_step", lambda run, batches: steps.append(run.step) or plain(run, batches))
+    before = (stopped / "last.ckpt").read_bytes()
+    with pytest.raises(OutputError, match=r"runs/a: holds a run that was stopped; --resume goes on with it, or remove"):
+        table()
+    assert (stopped / "last.ckpt").read_bytes() == before
+    assert table(resume=True).finished
+    assert steps == [3, 4, 5]
+    assert read_card(stopped / "final.safetensors").provenance["steps"] == "6"
+    (stopped / "final.safetensors").unlink()
+    (stopped / "last.ckpt").unlink()  # as of one that was killed before it
+    with pytest.raises(OutputError, match="holds a run that was stopped"):
+        table()
+    assert table(resume=True).finished
+    assert state(stopped)["step"] == 6
+
+
+def test_a_row_goes_on_with_its_own_settings_alone(table: Callable[..., TableResult], stopped: Path) -> None:
+    with pytest.raises(OutputError, match=r"runs/a: was trained with lr 0\.001, now 0\.01 is asked for; give another"):
+        table(resume=True, lr=0.01)
+    assert state(stopped)["step"] == 3
+    told = yaml.safe_load((stopped / "config.yaml").read_text())
+    (stopped / "config.yaml").write_text(yaml.safe_dump(told | {"lr": 0.01}))  # a run that went on, and did no step
+    with pytest.raises(OutputError, match=r"was trained with lr 0\.001, now 0\.01"):
+        table(resume=True, lr=0.01)
+    (stopped / "config.yaml").write_text(yaml.safe_dump(told))
+    assert table(resume=True, checkpoint_every=2).finished
+
+
+def test_a_row_is_done_by_the_weights_of_its_last_step_alone(
+    scenes: Path, tmp_path: Path, table: Callable[..., TableResult], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert table(epochs=1).finished
+    folder = tmp_path / "runs" / "a"
+    with stopping_at(3, monkeypatch):
+        assert not train(tmp_path / "a.yaml", resume=True, **settings(scenes, folder, epochs=3)).finished
+    assert read_card(folder / "final.safetensors").provenance["steps"] == "2"
+    with pytest.raises(OutputError, match="holds a run that was stopped"):
+        table()
+    assert table(resume=True).finished
+    assert read_card(folder / "final.safetensors").provenance["steps"] == "6"
+
+
 def test_a_table_leaves_out_a_task_without_labels(scenes: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     data = shutil.copytree(scenes, tmp_path / "data")
@@ -1167,6 +1276,32 @@ def test_the_seed_decides_the_first_weights(scenes: Path, tmp_path: Path, made: 
     assert not torch.equal(first, other)
 
 
+@pytest.mark.parametrize(
+    ("tasks", "cure"), [(TASKS, "; --tasks lane leaves detection out"), (("detection", "drivable"), "")]
+)
+def test_where_there_is_no_box_what_can_be_trained_instead_is_told(
+    scenes: Path, tmp_path: Path, tasks: tuple[Task, ...], cure: str
+) -> None:
+    data = shutil.copytree(scenes, tmp_path / "data", ignore=shutil.ignore_patterns("da_seg_annotations"))
+    for file in (data / "det_annotations/train").iterdir():
+        file.write_text('{"frames": [{"objects": []}]}')
+    options = settings(data, tmp_path / "run", auto_anchor=True, tasks=tasks)
+    with pytest.raises(DataError, match=f"data: no image of train has a box{cure}$"):
+        train(**options)
+    box = '{"category": "%s", "box2d": {"x1": 1, "y1": 2, "x2": 30, "y2": 40}}'
+    file.write_text(f'{{"frames": [{{"objects": [{box % "bicycle"}]}}]}}')
+    classes = "; --classes says what is learnt" + cure.replace(";", ",")
+    with pytest.raises(DataError, match=f"data: no box of train is of truck or bus, but of bicycle{classes}$"):
+        train(**options, classes=("truck", "bus"))
+    file.write_text(f'{{"frames": [{{"objects": [{box % "bus"}]}}]}}')
+    with pytest.raises(DataError, match="1 boxes of 1 sizes are too few to fit 9 anchors; train with --no-auto-anchor"):
+        train(**options, classes=("truck", "bus"))
+    ignored = box.replace("{", '{"attributes": {"crowd": true}, ', 1) % "bus"
+    file.write_text(f'{{"frames": [{{"objects": [{ignored}]}}]}}')
+    with pytest.raises(DataError, match="0 boxes of 0 sizes are too few"):
+        train(**options, classes=("truck", "bus"))
+
+
 def test_anchors_are_fitted_to_the_boxes_unless_others_are_known(
     scenes: Path, tmp_path: Path, made: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -1187,6 +1322,40 @@ def test_anchors_are_fitted_to_the_boxes_unless_others_are_known(
     fits = options | {"anchor_recall": 0.0, "init": str(tmp_path / "lane.safetensors")}
     torch.testing.assert_close(made(**fits)["network"].anchors, default)
     assert made(**fits)["card"].provenance["initial weights"] == "lane.safetensors"
+
+
+def test_a_head_of_initial_weights_goes_by_the_names_of_its_classes(
+    scenes: Path, tmp_path: Path, made: Callable[..., dict[str, Any]], caplog: pytest.LogCaptureFixture
+) -> None:
+    network = build_network("tiny", 2)
+    path = tmp_path / "two.safetensors"
+    save_network(network, path, dataclasses.replace(network.card, class_names=("person", "car")))
+    rows = network.state_dict()["detection.convs.0.weight"].view(3, 7, -1)
+
+    def taken(*classes: str, **more: Any) -> torch.Tensor:
+        run = made(**settings(scenes, tmp_path / "run", init=str(path), classes=classes, **more))
+        weight: torch.Tensor = run["network"].state_dict()["detection.convs.0.weight"]
+        return weight.view(3, 7, -1)
+
+    for classes, order in ((("person", "car"), [5, 6]), (("car", "person"), [6, 5])):
+        caplog.clear()
+        assert torch.equal(taken(*classes, freeze=("detection",)), rows[:, [0, 1, 2, 3, 4, *order]])
+        assert "its classes are" not in caplog.text
+    assert torch.equal(taken("person", "truck"), rows)
+    told = "its classes are person, car, the data set's person, truck"
+    assert f"{path}: {told}: the detection head is taken over by place" in caplog.text
+    with pytest.raises(ConfigError, match=f"{told}; a frozen detection head cannot learn them"):
+        train(**settings(scenes, tmp_path, init=str(path), classes=("person", "truck"), freeze=("detection.convs",)))
+    with pytest.raises(
+        ConfigError, match="its head tells 2 classes, the data set has 3: a frozen detection head would"
+    ):
+        train(**settings(scenes, tmp_path, init=str(path), classes=("a", "b", "c"), freeze=("detection",)))
+    made(**settings(scenes, tmp_path / "run", init="tiny", classes=("car",), freeze=("detection",)))
+    assert "tiny: its classes are vehicle, the data set's car: the detection head is taken" in caplog.text
+    caplog.clear()
+    for more in ({"classes": ("a", "b"), "tasks": ("lane",)}, {"classes": ("a", "b", "c")}):
+        made(**settings(scenes, tmp_path / "run", init=str(path), **more))
+    assert "its classes are" not in caplog.text
 
 
 def test_further_data_are_drawn_by_their_weight(scenes: Path, tmp_path: Path) -> None:

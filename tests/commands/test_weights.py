@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+import io
 import json
 import re
+import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +23,9 @@ from trilitenet.commands.evaluate import evaluate
 from trilitenet.commands.synthesize import synthesize
 from trilitenet.commands.weights import finish, import_weights, info
 from trilitenet.config import shipped_weights
-from trilitenet.errors import ConfigError, OutputError, WeightsError
-from trilitenet.models.weights import load_network, read_card
+from trilitenet.errors import ConfigError, DataError, OutputError, WeightsError
+from trilitenet.models.trilitenet import build_network
+from trilitenet.models.weights import load_network, read_card, save_network
 
 
 @pytest.fixture
@@ -53,6 +58,41 @@ def test_an_existing_file_is_kept(published: Path, tmp_path: Path) -> None:
     assert out.read_text() == "precious"
     import_weights(published, out, overwrite=True)
     assert info(str(out)).variant == "tiny"
+
+
+def test_no_checkpoint_is_lost_and_none_is_called_otherwise_than_weights(published: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"out\.onnx: weights end with \.safetensors"):
+        import_weights(published, tmp_path / "out.onnx")
+    only = published.rename(tmp_path / "only.safetensors")
+    before = only.read_bytes()
+    with pytest.raises(OutputError, match=r"only\.safetensors: is the checkpoint itself, which would be lost"):
+        import_weights(only, tmp_path / "." / "only.safetensors", overwrite=True)
+    assert only.read_bytes() == before
+
+
+@pytest.mark.parametrize("verb", ["import", "info", "info --json-output", "finish"])
+def test_what_standard_output_cannot_encode_is_no_traceback(
+    verb: str, published: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    foreign = tmp_path / "車.safetensors"
+    network = build_network("tiny")
+    save_network(network, foreign, dataclasses.replace(network.card, class_names=("車",)))
+    out = str(tmp_path / "ü.safetensors")
+    words = {
+        "import": [str(published), out],
+        "info": [str(foreign)],
+        "info --json-output": [str(foreign)],
+        "finish": ["tiny", out, "--data", str(scenes), "--split", "test", "--input-size", "96", "160"],
+    }
+    stream = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(stream, encoding="ascii"))
+    assert main(["weights", *verb.split(), *words[verb]]) == 0
+    sys.stdout.flush()
+    told = stream.getvalue().decode("ascii")
+    if verb == "info --json-output":
+        assert json.loads(told)["class_names"] == ["車"]
+    else:
+        assert "?" in told
 
 
 def test_info_of_what_is_not_there() -> None:
@@ -108,6 +148,27 @@ def test_finished_weights_hold_thresholds_figures_and_what_people_say(
         finish("tiny", out, data=scenes)
 
 
+def test_what_no_label_fixes_is_told(scenes: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    data, out = tmp_path / "data", tmp_path / "out.safetensors"
+    shutil.copytree(scenes / "images", data / "images")
+    options: dict[str, Any] = {"data": data, "split": "test", "input_size": (96, 160)}
+    with pytest.raises(DataError, match=r"data: nothing in test is labelled for detection, drivable, lane; take"):
+        finish("tiny", out, **options)
+    assert not out.exists()
+    shutil.copytree(scenes / "da_seg_annotations", data / "da_seg_annotations")
+    boxes = shutil.copytree(scenes / "det_annotations", data / "det_annotations") / "test"
+    box = '{"category": "boat", "box2d": {"x1": 1, "y1": 1, "x2": 9, "y2": 9}}'
+    for file in boxes.iterdir():
+        file.write_text(f'{{"frames": [{{"objects": [{box}]}}]}}')
+    caplog.clear()
+    thresholds = finish("tiny", out, **options).thresholds
+    before = read_card("tiny").thresholds
+    assert (thresholds.confidence, thresholds.lane) == (before.confidence, before.lane)
+    first, second = (record.getMessage() for record in caplog.records)
+    assert first.startswith(f"no box of {data} is of the class vehicle, and those of boat are of none")
+    assert second == f"{data}: nothing in test is labelled for detection, lane, whose threshold stays as it is"
+
+
 def test_a_card_text_with_an_unknown_key_is_refused_before_the_work(scenes: Path, tmp_path: Path) -> None:
     (tmp_path / "card.yaml").write_text("license: MIT\n")
     with pytest.raises(ConfigError, match="licence"):
@@ -158,6 +219,7 @@ def test_every_shipped_file_says_what_it_is() -> None:
         assert card.training_data
         assert card.notes
         assert "non-commercial" in card.licence
+        assert (Path(__file__).resolve().parents[2] / "LICENSE-WEIGHTS").read_text().startswith(f"{card.licence}\n")
         assert {"recipe", "seed", "hours", "hardware", "labels"} <= card.provenance.keys()
         assert 0 < card.metrics["val fair/drivable/iou"] < 1
 

@@ -55,6 +55,25 @@ def test_anchors_that_suit_well_enough_are_kept() -> None:
     assert kept.anchors == DEFAULT_ANCHORS
 
 
+def test_anchors_that_fit_better_but_take_fewer_boxes_are_not_taken() -> None:
+    squares = np.array([[8.0 * 2**k] * 2 for k in range(9)])
+    thin = np.full((20, 2), [4.0, 400.0])
+    old = np.concatenate([squares[:8] * 1.2, thin[:1]])
+    before = tuple(tuple((float(width), float(height)) for width, height in level) for level in old.reshape(3, 3, 2))
+    fit = fit_anchors(np.concatenate([np.repeat(squares, 1000, axis=0), thin]), before)
+    assert (fit.anchors, fit.recall_after) == (before, 1.0)
+    assert fit.fit_before < 0.9
+
+
+def test_lost_clusters_are_filled_from_the_smallest_box_to_the_largest() -> None:
+    common, rare = np.full((5000, 2), [40.0, 30.0]), np.array([[10.0 + 3 * k, 8.0 + 2 * k] for k in range(14, 22)])
+    fit = fit_anchors(np.concatenate([common, rare / 2, rare * 2]), (((7.0, 6.0),) * 3,) * 3)
+    flat = np.array(fit.anchors).reshape(-1, 2)
+    assert fit.changed
+    assert flat[0].tolist() == [26.0, 18.0]
+    assert flat[-1].tolist() == [146.0, 100.0]
+
+
 def test_is_deterministic() -> None:
     assert fit_anchors(wide_boxes(), DEFAULT_ANCHORS, seed=3) == fit_anchors(wide_boxes(), DEFAULT_ANCHORS, seed=3)
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from trilitenet.engine.transfer import freeze, initialise, keep_frozen
+from trilitenet.engine.transfer import freeze, initialise, keep_frozen, order_classes
 from trilitenet.errors import ConfigError
 from trilitenet.models.trilitenet import build_network
 
@@ -38,6 +38,18 @@ def test_weights_of_another_variant_are_refused_and_nothing_is_taken() -> None:
     with pytest.raises(ConfigError, match=r"of 2,350,206 parameters .* another variant"):
         initialise(network, build_network("tiny"))
     torch.testing.assert_close(network.state_dict(), before)
+
+
+def test_classes_in_another_order_answer_to_their_names() -> None:
+    source, network = build_network("tiny", 3), build_network("tiny", 3)
+    network.load_state_dict(source.state_dict())
+    assert network.detection is not None
+    order_classes(network.detection, ("car", "person", "bus"), ("bus", "car", "person"))
+    image = torch.randn(1, 3, 64, 64)
+    with torch.no_grad():
+        before, after = source.eval()(image).detection, network.eval()(image).detection
+    for old, new in zip(before, after, strict=True):
+        torch.testing.assert_close(new, old[..., [0, 1, 2, 3, 4, 7, 5, 6]])
 
 
 def test_frozen_parts_learn_nothing() -> None:

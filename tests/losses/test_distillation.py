@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import pytest
@@ -92,3 +93,13 @@ def test_boxes_count_where_the_teacher_sees_an_object() -> None:
     same, off, wrong = (float(distil_boxes(one, teacher, anchors, anchors)) for one in (teacher, elsewhere, there))
     assert off == pytest.approx(same, abs=1e-6)
     assert wrong > same + 0.01
+
+
+def test_a_box_of_twice_the_sides_costs_its_missing_overlap() -> None:
+    teacher = torch.zeros(1, 1, 1, 1, 6)
+    teacher[..., 4] = 20.0
+    student = teacher.clone()
+    student[..., 2:4] = math.log(math.sqrt(0.5) / (1 - math.sqrt(0.5)))  # (2 sigmoid)^2 = 2
+    anchors = torch.ones(1, 2)
+    same, twice = (float(distil_boxes(one, teacher, anchors, anchors)) for one in (teacher, student))
+    assert twice - same == pytest.approx(0.05 * (1 - 1 / 4), abs=1e-5)

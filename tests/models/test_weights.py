@@ -6,6 +6,8 @@ import dataclasses
 import json
 import os
 import pickle
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
-from torch import nn
+from torch import Tensor, nn
 
 from tests.models.conftest import published_state
 from trilitenet import build_network, load_network
@@ -170,6 +172,14 @@ def test_a_training_state_is_told_from_weights(tmp_path: Path) -> None:
     assert not (tmp_path / "out.safetensors").exists()
 
 
+def test_a_card_without_tasks_is_refused(saved: Path) -> None:
+    card = json.loads(ModelCard("tiny").to_json()) | {"tasks": []}
+    save_file(load_file(saved), saved, metadata={CARD_KEY: json.dumps(card)})
+    for read in (read_card, load_network):
+        with pytest.raises(WeightsError, match=r"net\.safetensors: at least one task is needed"):
+            read(saved)
+
+
 @pytest.mark.parametrize(
     ("anchors", "message"),
     [
@@ -225,8 +235,11 @@ def test_every_published_key_has_a_name_of_ours(golden: dict[str, NDArray[Any]])
 
 
 class _Code:
+    def __init__(self, touched: Path) -> None:
+        self._touched = touched
+
     def __reduce__(self) -> tuple[Any, ...]:
-        return (os.system, ("touch /tmp/must-not-exist",))
+        return (os.system, (f"touch '{self._touched}'",))
 
 
 def test_import_refuses_what_is_not_a_checkpoint(golden: dict[str, NDArray[Any]], tmp_path: Path) -> None:
@@ -236,19 +249,24 @@ def test_import_refuses_what_is_not_a_checkpoint(golden: dict[str, NDArray[Any]]
     network = build_network("tiny")
     save_network(network, tmp_path / "whole.safetensors", network.card)
     (tmp_path / "cut.safetensors").write_bytes((tmp_path / "whole.safetensors").read_bytes()[:20_000])
+    (tmp_path / "cut2.pth").write_bytes((tmp_path / "whole.safetensors").read_bytes()[:20_000])
     (tmp_path / "text.pth").write_text("hello")
     (tmp_path / "empty.pth").touch()
-    (tmp_path / "code.pth").write_bytes(pickle.dumps({"a": _Code()}))
-    torch.save({"zip": _Code()}, tmp_path / "zipcode.pth")
+    (tmp_path / "code.pth").write_bytes(pickle.dumps({"a": _Code(tmp_path / "touched")}))
+    torch.save({"zip": _Code(tmp_path / "touched")}, tmp_path / "zipcode.pth")
     torch.save([1, 2], tmp_path / "list.pth")
     torch.save({"conv.weight": torch.zeros(1)}, tmp_path / "foreign.pth")
     torch.save({k: v for k, v in state.items() if "caam.fuse" not in k}, tmp_path / "missing.pth")
     torch.save({**state, "model.9.weight": torch.zeros(1)}, tmp_path / "surplus.pth")
     torch.save({**state, "module.model.2.m.0.bias": state["model.2.m.0.bias"] + 1}, tmp_path / "mixed.pth")
+    torch.save({"lane.out.bn.bias": state["model.5.bn.bias"] + 1, **state}, tmp_path / "ours.pth")
+    reduce = state["model.0.level2_0.c1.conv.weight"] + 1
+    torch.save({**state, "model.0.level2_down.reduce.weight": reduce}, tmp_path / "twice.pth")
     torch.save({k: v for k, v in state.items() if "anchor_grid" not in k}, tmp_path / "anchors.pth")
     cases = {
         "cut.pth": "truncated",
         "cut.safetensors": "ends in .safetensors, but is not such a file, or is truncated",
+        "cut2.pth": "is a safetensors file, but is damaged, or is truncated",
         "text.pth": "not a PyTorch checkpoint",
         "empty.pth": "is empty",
         "code.pth": "holds code",
@@ -258,6 +276,8 @@ def test_import_refuses_what_is_not_a_checkpoint(golden: dict[str, NDArray[Any]]
         "missing.pth": "missing pcaa.fuse",
         "surplus.pth": "surplus model.9",
         "mixed.pth": "surplus module.model.2.m.0.bias",
+        "ours.pth": "surplus lane.out.bn.bias",
+        "twice.pth": "surplus model.0.level2_down.reduce.weight",
         "anchors.pth": "missing model.2.anchor_grid",
         "absent.pth": "does not exist",
     }
@@ -266,6 +286,62 @@ def test_import_refuses_what_is_not_a_checkpoint(golden: dict[str, NDArray[Any]]
             import_published(tmp_path / name, tmp_path / "out.safetensors")
         assert "it is not a TriLiteNet checkpoint" not in str(caught.value)  # most of it is there
         assert not (tmp_path / "out.safetensors").exists()
+    assert not (tmp_path / "touched").exists()
+
+
+def test_a_cut_or_damaged_checkpoint_of_the_older_format_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "old.pth"
+    torch.save({"a": torch.zeros(4)}, path, _use_new_zipfile_serialization=False)
+    whole = path.read_bytes()
+    for length in range(1, len(whole), 3):
+        for rest in (b"", b"\0" + whole[length + 1 :]):
+            path.write_bytes(whole[:length] + rest)
+            with pytest.raises(WeightsError, match=r"old\.pth: "):
+                import_published(path, tmp_path / "out.safetensors")
+
+
+def _with(dtype: torch.dtype) -> Callable[[Tensor], Tensor]:
+    return lambda tensor: tensor.to(dtype)
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "message"),
+    [
+        ("model.5.deconv.weight", lambda tensor: tensor.to_sparse(), "sparse, quantised or without values"),
+        ("model.5.deconv.weight", lambda tensor: tensor.to("meta"), "sparse, quantised or without values"),
+        (
+            "model.5.deconv.weight",
+            lambda tensor: torch.nested.nested_tensor([tensor]),
+            "sparse, quantised or without values",
+        ),
+        (
+            "model.5.deconv.weight",
+            lambda tensor: torch.quantize_per_tensor(tensor, 0.1, 0, torch.qint8),
+            "sparse, quantised or without values",
+        ),
+        ("model.5.deconv.weight", _with(torch.int8), "lane.out.deconv.weight is of torch.int8, must be of floating"),
+        ("model.5.deconv.weight", _with(torch.bool), "is of torch.bool"),
+        ("model.5.deconv.weight", _with(torch.complex64), "is of torch.complex64"),
+        ("model.5.bn.running_var", torch.neg, "lane.out.bn.running_var holds negative variances"),
+        ("model.2.anchor_grid", _with(torch.complex64), "model.2.anchor_grid must hold 3 x 3 positive sizes"),
+        ("model.2.anchor_grid", lambda tensor: tensor / 0, "model.2.anchor_grid must hold"),
+        ("model.2.anchors", torch.neg, "model.2.anchors must hold 3 x 3 positive sizes"),
+    ],
+)
+def test_tensors_that_are_not_what_they_should_be_are_refused(
+    key: str, change: Callable[[Tensor], Tensor], message: str, golden: dict[str, NDArray[Any]], tmp_path: Path
+) -> None:
+    state = published_state("tiny", golden)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of types that PyTorch means to drop
+        torch.save({**state, key: change(state[key])}, tmp_path / "odd.pth")
+        with pytest.raises(WeightsError, match=message):
+            import_published(tmp_path / "odd.pth", tmp_path / "out.safetensors")
+
+
+def test_a_safetensors_file_is_known_by_its_content(golden: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    save_file(published_state("tiny", golden), tmp_path / "published.pth")
+    assert import_published(tmp_path / "published.pth", tmp_path / "ours.safetensors").variant == "tiny"
 
 
 def test_import_refuses_the_wrong_variant(golden: dict[str, NDArray[Any]], tmp_path: Path) -> None:

@@ -175,3 +175,15 @@ def test_dark_16_bit_grey_stays_dark() -> None:
     dark = np.full((4, 6), 200, np.uint16)
     dark[0, 0] = 255
     np.testing.assert_array_equal(read_image(encoded(Image.fromarray(dark), "PNG"))[1:], 1)
+
+
+def test_a_palette_with_transparency_is_read_without_a_word(recwarn: pytest.WarningsRecorder) -> None:
+    picture = Image.new("P", (4, 3), 1)
+    picture.putpalette([9, 8, 7, 30, 60, 90])
+    picture.info["transparency"] = b"\x00\x80"
+    file = io.BytesIO()
+    picture.save(file, "PNG")
+    for given in (file.getvalue(), picture):
+        assert (read_image(given) == (30, 60, 90)).all()
+    assert picture.info["transparency"] == b"\x00\x80"
+    assert not recwarn.list

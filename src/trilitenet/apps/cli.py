@@ -202,6 +202,8 @@ def main(words: Sequence[str] | None = None) -> int:
         The exit code.
     """
     _open_closed_streams()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a terminal or a pipe of another encoding lacks the rules of tables
     ends = words is None  # with this function, the process
     words = sys.argv[1:] if words is None else words
     if ends and _SPARING.intersection(words[:1]) and "OMP_WAIT_POLICY" not in os.environ:
@@ -338,8 +340,6 @@ def _show(result: object) -> None:
         OutputError: If standard output takes no more.
     """
     text = result.summary() if hasattr(result, "summary") else result
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # a terminal or a pipe of another encoding lacks the rules of tables
     try:
         sys.stdout.write(f"{text}\n" if isinstance(text, str) and text else "")
         sys.stdout.flush()

@@ -68,7 +68,7 @@ def load(
         long_side: The longer side of an image is resized to so many pixels; by default as in training, or as the input
             of an artefact is fixed to.
         batch_size: At most so many images go through the network at once.
-        streams: Images that OpenVINO computes at once: more frames a second, more latency.
+        streams: Images that OpenVINO computes at once: more frames a second, more latency. Other runtimes have none.
         threads: Threads of the runtime; its own choice if left out. PyTorch and ExecuTorch have one number for the
             whole process.
 

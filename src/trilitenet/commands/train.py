@@ -9,12 +9,13 @@ import inspect
 import json
 import logging
 import math
+import os
 import re
 import sys
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final, get_type_hints
+from typing import Annotated, Any, Final, get_args, get_type_hints
 
 import cyclopts
 import numpy as np
@@ -51,7 +52,7 @@ from trilitenet.engine.recipe import TrainConfig, merge, read_recipe
 from trilitenet.engine.results import write_results
 from trilitenet.engine.runtime import follow, running_fabric
 from trilitenet.engine.train import CHECKPOINT_NAME, Trainer, TrainResult, figures_in_words, holds_run
-from trilitenet.engine.transfer import freeze, initialise
+from trilitenet.engine.transfer import freeze, initialise, order_classes
 from trilitenet.errors import ConfigError, DataError, OutputError, TriLiteNetError, few, import_extra
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.torch_backend import TorchBackend
@@ -60,7 +61,8 @@ from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.losses.multitask import MultiTaskLoss
 from trilitenet.losses.segmentation import SegmentationLoss
 from trilitenet.models.builders import build_by
-from trilitenet.models.trilitenet import TriLiteNet
+from trilitenet.models.detection import DetectionHead
+from trilitenet.models.trilitenet import TriLiteNet, foreign_layers
 from trilitenet.models.weights import load_network, read_card
 
 __all__ = ["build_loss", "train", "training_data", "validation_figures"]
@@ -119,6 +121,8 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
         _LOGGER.warning("swapped_anchors changes nothing without auto_anchor, which fits them")
     if config.patience and not config.val_split:
         _LOGGER.warning("patience stops nothing without val_split, whose figures it watches")
+    if not config.warmup_epochs and config.warmup_steps not in (0, TrainConfig.warmup_steps):
+        _LOGGER.warning("warmup_steps changes nothing where warmup_epochs is 0, which is no warm-up")
     torch.manual_seed(config.seed)
     with _display(quiet=not fabric.is_global_zero) as display:
         dataset = training_data(config)
@@ -242,6 +246,31 @@ def _check_labels(config: TrainConfig, dataset: SampleSource, display: _Display)
                     )
 
 
+def _check_boxes(config: TrainConfig, dataset: SampleSource) -> None:
+    """Refuse data without a box of a class, that anchors could be fitted to.
+
+    Raises:
+        DataError: If it is so; it names what can be trained instead.
+    """
+    parts, taught, others = list(parts_of(dataset)), _taught(config), set[str]()
+    for part in parts:
+        if isinstance(part, DrivingDataset):
+            without, found = part.classes_without_boxes()
+            if found and len(without) < len(part.class_names):
+                return
+            others |= found.difference(part.description.ignore)
+    reason, cures = f"no image of {config.train_split} has a box", []
+    if others:
+        reason = (
+            f"no box of {config.train_split} is of {' or '.join(dataset.class_names)}, but of {few(sorted(others))}"
+        )
+        cures.append("--classes says what is learnt")
+    tasks = [task for task in config.tasks if task != "detection"]
+    if left := [task for task in tasks if task in taught or any(part.has_labels(task) for part in parts)]:
+        cures.append(f"--tasks {' '.join(left)} leaves detection out")
+    raise DataError(f"{config.data}: {reason}{'; ' if cures else ''}{', '.join(cures)}")
+
+
 def _taught(config: TrainConfig) -> frozenset[Task]:
     """Return the tasks that a teacher teaches.
 
@@ -314,6 +343,8 @@ def _network(config: TrainConfig, dataset: SampleSource, display: _Display, *, r
         # Weights that are taken over were trained with anchors of their own: those are kept where they fit.
         before = DEFAULT_ANCHORS if initial is None or "detection" not in initial.tasks else initial.card.anchors
         if len(sizes) or "detection" not in _taught(config):
+            if not len(sizes):
+                _check_boxes(config, dataset)
             fit = fit_anchors(sizes, before, enough=enough, seed=config.seed)
             display.line(fit.summary())
             anchors = fit.anchors
@@ -331,11 +362,39 @@ def _network(config: TrainConfig, dataset: SampleSource, display: _Display, *, r
     )
     if initial is not None:
         fitted = network.anchors.clone()
+        _match_classes(config, initial, dataset.class_names)
         display.line(f"{config.init}: {initialise(network, initial).summary()}")
         if anchors is not None:
             network.anchors.copy_(fitted)
     freeze(network, config.freeze)
     return network
+
+
+def _match_classes(config: TrainConfig, initial: TriLiteNet, names: Sequence[str]) -> None:
+    """Put the classes of initial weights in the order of the data set's ``names``; warn where they are others.
+
+    Raises:
+        ConfigError: If a frozen head of several classes would go by other names than it has learnt, or begin at random.
+    """
+    told = initial.card.class_names
+    frozen = any(part.partition(".")[0] == "detection" for part in config.freeze)
+    if "detection" not in set(initial.tasks).intersection(config.tasks):
+        return  # there is no head to take over
+    if len(told) != len(names):  # it does not fit
+        if frozen:
+            raise ConfigError(
+                f"{config.init}: its head tells {len(told)} classes, the data set has {len(names)}: a frozen detection "
+                "head would stay as it begins, at random; leave it out of --freeze"
+            )
+        return
+    own = any(layer.startswith(("detection", "the network")) for layer in foreign_layers(initial))
+    if isinstance(initial.detection, DetectionHead) and not own and set(told) == set(names):
+        order_classes(initial.detection, told, names)
+    elif told != tuple(names):
+        what = f"{config.init}: its classes are {', '.join(told)}, the data set's {', '.join(names)}"
+        if frozen and len(names) > 1:
+            raise ConfigError(f"{what}; a frozen detection head cannot learn them, leave it out of --freeze")
+        _LOGGER.warning("%s: the detection head is taken over by place", what)
 
 
 def _card(config: TrainConfig, network: TriLiteNet, dataset: SampleSource, recipe: Path | None) -> ModelCard:
@@ -511,14 +570,31 @@ def _flags(config: type[Any], prefix: str = "") -> list[inspect.Parameter]:
     return flags
 
 
+def _without_paths(value: Any) -> Any:
+    """Return a setting with the paths in it as text, as recipes hold them."""
+    if isinstance(value, Mapping):
+        return {_without_paths(key): _without_paths(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_paths(item) for item in value]
+    return os.fspath(value) if isinstance(value, os.PathLike) else value
+
+
 def _nested(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings as a recipe holds them: no None, ``augmentation__flip`` within ``augmentation``, YAML read."""
+    """Return settings as a recipe holds them: ``augmentation__flip`` within ``augmentation``, YAML read, paths as text.
+
+    None stands for what was not given, save where a setting may be None; one text stands for several of one.
+    """
+    hints = get_type_hints(TrainConfig)
     settings: dict[str, Any] = {}
     for name, value in fields.items():
-        if value is None:
+        kinds = (hints.get(name), *get_args(hints.get(name)))
+        if value is None and type(None) not in kinds:
             continue
+        value = _without_paths(value)
         if name in _YAML_FLAGS and isinstance(value, str):
             value = parse_yaml(value, f"--{name.replace('__', '.').replace('_', '-')}")
+        elif isinstance(value, str) and any(Ellipsis in get_args(kind) for kind in kinds):
+            value = [value]
         first, *inner = name.split("__")
         for part in reversed(inner):
             value = {part: value}

@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 from trilitenet.commands.evaluate import check_counts
 from trilitenet.commands.load import load
 from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, one_for_several
 from trilitenet.commands.progress import show_progress
-from trilitenet.config import STRIDES, ModelCard, check_size, parse, read_yaml
+from trilitenet.config import STRIDES, TASKS, ModelCard, check_size, parse, read_yaml
 from trilitenet.data.reading import DrivingDataset
-from trilitenet.engine.evaluate import best_thresholds
+from trilitenet.engine.evaluate import BestThresholds, best_thresholds
 from trilitenet.engine.evaluate import evaluate as run_evaluation
-from trilitenet.errors import ConfigError, OutputError, scratch_folder
+from trilitenet.errors import ConfigError, DataError, OutputError, scratch_folder
 from trilitenet.models.weights import import_published, load_network, read_card, resolve_weights, save_network
 
 __all__ = ["CardText", "finish", "import_weights", "info"]
+
+_LOGGER: Final = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,10 +57,16 @@ def import_weights(
 
     Returns:
         The card written into the file.
+
+    Raises:
+        ConfigError: If the destination does not end with .safetensors.
+        WeightsError: If the source is not such a checkpoint, is truncated, or holds code.
+        OutputError: If the destination exists already, is the source, or cannot be written.
     """
     source, destination = Path(source), Path(destination)
-    if destination.exists() and not overwrite:
-        raise OutputError(f"{destination}: exists already; give another name or --overwrite")
+    _check_destination(destination, overwrite=overwrite)
+    if source.exists() and destination.exists() and source.samefile(destination):
+        raise OutputError(f"{destination}: is the checkpoint itself, which would be lost; give another name")
     card = import_published(source, destination, variant)
     sys.stdout.write(f"{destination}: {card.variant}, {card.classes} class(es), from {source.name}\n")
     return card
@@ -101,13 +112,11 @@ def finish(
 
     Raises:
         ConfigError: If the input size is not of multiples of 32, or the batch size below 1.
+        DataError: If nothing in the split is labelled for any task.
         OutputError: If the destination exists already, or cannot be written.
     """
     destination, data = Path(destination), Path(data)
-    if destination.suffix != ".safetensors":
-        raise ConfigError(f"{destination}: weights end with .safetensors")
-    if destination.exists() and not overwrite:
-        raise OutputError(f"{destination}: exists already; give another name or --overwrite")
+    _check_destination(destination, overwrite=overwrite)
     check_writable(destination)
     if input_size is not None:
         check_size(input_size, "--input-size")
@@ -124,7 +133,10 @@ def finish(
         # Measured as stored: what the user loads is what the figures are of.
         save_network(trained, draft, dataclasses.replace(described, metrics={}), half=not full)
         with load(draft, network=network) as predictor, show_progress("thresholds") as shown:
+            if "detection" in described.tasks:
+                dataset.warn_of_foreign(shown)
             best = best_thresholds(predictor, dataset, batch_size=batch_size, progress=shown)
+            _check_measured(best, described, f"{data}: nothing in {split}")
             predictor.thresholds = best.thresholds
             shown.name("figures")
             report = run_evaluation(
@@ -141,6 +153,27 @@ def finish(
         save_network(trained, destination, finished, half=not full)
     sys.stdout.write(f"{report.summary()}\nwritten to {destination}\n")
     return finished
+
+
+def _check_destination(path: Path, *, overwrite: bool) -> None:
+    if path.suffix != ".safetensors":
+        raise ConfigError(f"{path}: weights end with .safetensors")
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists already; give another name or --overwrite")
+
+
+def _check_measured(best: BestThresholds, card: ModelCard, nothing: str) -> None:
+    """Warn of tasks whose thresholds stay as they are for want of labels, by a message that begins with ``nothing``.
+
+    Raises:
+        DataError: If all would.
+    """
+    values = dict(zip(TASKS, (best.detection_f1, best.drivable_iou, best.lane_iou), strict=True))
+    without = [task for task in card.tasks if math.isnan(values[task])]
+    if len(without) == len(card.tasks):
+        raise DataError(f"{nothing} is labelled for {', '.join(without)}; take another --split")
+    if without:
+        _LOGGER.warning("%s is labelled for %s, whose threshold stays as it is", nothing, ", ".join(without))
 
 
 def _describe(card: ModelCard, texts: Sequence[CardText]) -> ModelCard:
@@ -168,7 +201,7 @@ def info(file: NameOrPath, /, *, json_output: bool = False) -> ModelCard:
     """
     card = read_card(file)
     if json_output:
-        sys.stdout.write(json.dumps(dataclasses.asdict(card), indent=2, ensure_ascii=False) + "\n")
+        sys.stdout.write(json.dumps(dataclasses.asdict(card), indent=2) + "\n")  # the same in any encoding
         return card
     thresholds = card.thresholds
     lines = [

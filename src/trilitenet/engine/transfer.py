@@ -10,8 +10,9 @@ import torch
 from torch import nn
 
 from trilitenet.errors import ConfigError, did_you_mean
+from trilitenet.models.detection import DetectionHead
 
-__all__ = ["TransferReport", "freeze", "initialise", "keep_frozen"]
+__all__ = ["TransferReport", "freeze", "initialise", "keep_frozen", "order_classes"]
 
 
 LEAST_SHARE: Final = 0.25
@@ -70,6 +71,21 @@ def initialise(network: nn.Module, source: nn.Module) -> TransferReport:
         ours[name].copy_(theirs[name])
     surplus = [name for name in theirs if name not in ours]
     return TransferReport(tuple(loaded), tuple(misshapen), tuple(missing), tuple(surplus))
+
+
+@torch.no_grad()
+def order_classes(head: DetectionHead, names: Sequence[str], wanted: Sequence[str]) -> None:
+    """Put the classes of a detection head in another order.
+
+    Args:
+        head: The head.
+        names: Its classes, each once.
+        wanted: The same classes in the order to put them in.
+    """
+    order = [*range(5), *(5 + names.index(name) for name in wanted)]  # box and objectness stay
+    for parameter in head.parameters():  # (anchors x (5 + classes), ...) each
+        rows = parameter.unflatten(0, (-1, len(order)))
+        parameter.copy_(rows[:, order].flatten(0, 1))
 
 
 def freeze(network: nn.Module, parts: Sequence[str]) -> None:

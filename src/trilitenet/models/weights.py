@@ -10,9 +10,10 @@ import hashlib
 import os
 import pickle
 import re
+import struct
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,6 +29,7 @@ from trilitenet.config import (
     VARIANTS,
     ModelCard,
     check_anchors,
+    check_tasks,
     get_variant,
     shipped_weights,
 )
@@ -80,11 +82,23 @@ _RENAMES: Final = (
 )
 """Published key prefixes and ours; the first match wins."""
 
+_ANCHOR_KEYS: Final = ("model.2.anchors", "model.2.anchor_grid")
+"""Published keys of the anchors: in cells, and in pixels."""
+
 _FOREIGN_KEY: Final = "trilitenet.foreign_layers"
 """Key, in a file's metadata, of the layers that `build_network` does not make; absent where there are none."""
 
 _NETWORK_KEY: Final = "trilitenet.network"
 """Key, in a file's metadata, of the name of the function that built the network; absent for `build_network`."""
+
+_UNREADABLE: Final = (
+    RuntimeError, EOFError, OSError, ValueError, KeyError, IndexError, AttributeError, TypeError, AssertionError,
+    struct.error,
+)  # fmt: skip
+"""What PyTorch raises, beside `pickle.UnpicklingError`, of a file that is no checkpoint, cut or damaged."""
+
+_LONGEST_HEADER: Final = 100_000_000
+"""Bytes of a safetensors file's header, which the format limits; the file begins with their number."""
 
 _TRAINING_STATE: Final = frozenset({"schema", "config", "network", "optimiser"})
 """Keys that tell the training state of `trilitenet train` from other pickles."""
@@ -253,12 +267,17 @@ def import_published(
     anchors = _published_anchors(state, source)
     classes = _published_classes(state, source)
     network = build_network(guessed, classes, anchors=anchors)
-    ours = {
-        rename_published(key): value
-        for key, value in state.items()
-        if key not in {"model.2.anchors", "model.2.anchor_grid"}
-    }
-    _load_strictly(network, ours, str(source), published=True)
+    ours: dict[str, Tensor] = {}
+    foreign = []
+    for key, value in state.items():
+        name = rename_published(key)
+        if key in _ANCHOR_KEYS:
+            continue
+        if name == key or name in ours:  # no published name, though it may be one of ours, or a second of one tensor
+            foreign.append(key)
+        else:
+            ours[name] = value
+    _load_strictly(network, ours, str(source), published=True, foreign=foreign)
     digest = hashlib.sha256(source.read_bytes()).hexdigest()
     card = dataclasses.replace(
         network.card,
@@ -289,6 +308,7 @@ def _open(path: Path, *, tensors: bool) -> tuple[ModelCard, dict[str, str], dict
                 raise WeightsError(f"{path}: is safetensors, but has no trilitenet card; it is another model's")
             card = ModelCard.from_json(metadata[CARD_KEY], str(path))
             get_variant(card.variant)
+            check_tasks(card.tasks)
             keys = list(file.keys()) if tensors else []
             return card, metadata, {key: file.get_tensor(key) for key in keys}
     except SafetensorError as error:
@@ -332,11 +352,18 @@ def _about_training_state(path: Path) -> str:
     )
 
 
-def _load_strictly(network: TriLiteNet, tensors: Mapping[str, Tensor], source: str, *, published: bool = False) -> None:
+def _load_strictly(
+    network: TriLiteNet,
+    tensors: Mapping[str, Tensor],
+    source: str,
+    *,
+    published: bool = False,
+    foreign: Sequence[str] = (),
+) -> None:
     own = network.state_dict()
     optional = {key for key in own if key == "anchors" or key.endswith("num_batches_tracked")}
     missing = [key for key in own if key not in tensors and key not in optional]
-    surplus = [key for key in tensors if key not in own]
+    surplus = [*foreign, *(key for key in tensors if key not in own)]
     if missing or surplus:
         hint = " (it is not a TriLiteNet checkpoint)" if published and len(missing) > len(own) // 2 else ""
         wrong = [f"{what} {few(keys)}" for what, keys in (("missing", missing), ("surplus", surplus)) if keys]
@@ -344,9 +371,20 @@ def _load_strictly(network: TriLiteNet, tensors: Mapping[str, Tensor], source: s
     for key, tensor in tensors.items():
         if tensor.shape != own[key].shape:
             raise WeightsError(f"{source}: {key} is {tuple(tensor.shape)}, must be {tuple(own[key].shape)}")
-        if not torch.isfinite(tensor.to(own[key].dtype)).all():  # as it is loaded: of 8-bit floats it cannot be told
+        if own[key].is_floating_point() and not tensor.is_floating_point():
+            raise WeightsError(f"{source}: {key} is of {tensor.dtype}, must be of floating-point numbers")
+        value = tensor.to(own[key].dtype)  # as it is loaded: of 8-bit floats it cannot be told
+        if not torch.isfinite(value).all():
             raise WeightsError(f"{source}: {key} holds values that are not finite; the file is damaged")
+        if key.endswith("running_var") and (value < 0).any():
+            raise WeightsError(f"{source}: {key} holds negative variances; the file is damaged")
     network.load_state_dict({key: tensors.get(key, own[key]).to(own[key].dtype) for key in own})
+
+
+def _is_safetensors(path: Path) -> bool:
+    with path.open("rb") as file:
+        head = file.read(9)
+    return head[8:] == b"{" and int.from_bytes(head[:8], "little") <= _LONGEST_HEADER
 
 
 def _load_pickle(path: Path) -> Any:
@@ -355,8 +393,9 @@ def _load_pickle(path: Path) -> Any:
         raise WeightsError(f"{path}: {'is a folder' if path.is_dir() else 'does not exist'}")
     if path.stat().st_size == 0:
         raise WeightsError(f"{path}: is empty; download it again")
+    called = path.name.lower().endswith(".safetensors")
     try:
-        if path.name.lower().endswith(".safetensors"):  # PyTorch 2.6 would take it for a pickle
+        if called or _is_safetensors(path):  # PyTorch 2.6 would take it for a pickle
             return load_file(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # on pickle protocols: what cannot be read raises below
@@ -369,12 +408,11 @@ def _load_pickle(path: Path) -> Any:
             message = f"{path}: holds code or objects beside tensors{name}; it was not run, nor read"
             raise WeightsError(message) from error
         raise WeightsError(f"{path}: is not a PyTorch checkpoint, or is truncated") from error
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError, IndexError, AttributeError, TypeError) as error:
+    except _UNREADABLE as error:
         raise WeightsError(f"{path}: is not a PyTorch checkpoint, or is truncated") from error
     except SafetensorError as error:
-        raise WeightsError(
-            f"{path}: ends in .safetensors, but is not such a file, or is truncated ({error}); copy it again"
-        ) from error
+        what = "ends in .safetensors, but is not such a file" if called else "is a safetensors file, but is damaged"
+        raise WeightsError(f"{path}: {what}, or is truncated ({error}); copy it again") from error
 
 
 def _read_pickle(path: Path) -> dict[str, Tensor]:
@@ -386,9 +424,15 @@ def _read_pickle(path: Path) -> dict[str, Tensor]:
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()) or not state:
         raise WeightsError(f"{path}: is a pickle, but not a state dict of tensors")
     tensors: dict[str, Tensor] = {str(key): value for key, value in state.items()}
+    if odd := [key for key, value in tensors.items() if not _is_dense(value)]:
+        raise WeightsError(f"{path}: {few(odd)}: sparse, quantised or without values; save plain tensors of floats")
     if all(key.startswith("module.") for key in tensors):  # saved from a distributed wrapper
         tensors = {key.removeprefix("module."): value for key, value in tensors.items()}
     return tensors
+
+
+def _is_dense(tensor: Tensor) -> bool:
+    return tensor.layout is torch.strided and not (tensor.is_meta or tensor.is_quantized or tensor.is_nested)
 
 
 def _guess_variant(state: Mapping[str, Tensor], source: Path) -> str:
@@ -407,9 +451,11 @@ def _published_classes(state: Mapping[str, Tensor], source: Path) -> int:
 
 
 def _published_anchors(state: Mapping[str, Tensor], source: Path) -> Tensor:
-    for key in ("model.2.anchors", "model.2.anchor_grid"):
+    for key in _ANCHOR_KEYS:
         if key not in state:
             raise WeightsError(f"{source}: missing {key}; the boxes cannot be decoded without its anchors")
-        if state[key].numel() != 18 or not torch.isfinite(state[key]).all() or not (state[key] > 0).all():
-            raise WeightsError(f"{source}: {key} must hold 3 x 3 positive sizes, got {tuple(state[key].shape)}")
+        sizes = state[key]
+        usable = sizes.is_floating_point() and bool(((sizes.float() > 0) & (sizes.float() < torch.inf)).all())
+        if sizes.numel() != 18 or not usable:
+            raise WeightsError(f"{source}: {key} must hold 3 x 3 positive sizes, got {tuple(sizes.shape)}")
     return state["model.2.anchor_grid"].float().view(len(STRIDES), -1, 2)

@@ -138,6 +138,7 @@ def _decode(image: Image.Image, name: str) -> NDArray[np.uint8]:
             if image.mode.startswith("I;16"):
                 rows[top : top + _BAND] = _scale_deep(np.asarray(band), name, deep=True)
             else:
+                band.info.pop("transparency", None)  # alpha is dropped; Pillow would warn of a palette's
                 rows[top : top + _BAND] = np.asarray(band if band.mode == "RGB" else band.convert("RGB"))
         return array
     except InputError:
