@@ -1091,7 +1091,12 @@ def test_a_row_that_was_stopped_is_never_trained_anew_unasked(
 ) -> None:
     steps: list[int] = []
     plain = Trainer._train_step
-    monkeypatch.setattr(Trainer, "_train_step", lambda run, batches: steps.append(run.step) or plain(run, batches))
+
+    def train_step(self: Trainer, batches: Any) -> Any:
+        steps.append(self.step)
+        return plain(self, batches)
+
+    monkeypatch.setattr(Trainer, "_train_step", train_step)
     before = (stopped / "last.ckpt").read_bytes()
     with pytest.raises(OutputError, match=r"runs/a: holds a run that was stopped; --resume goes on with it, or remove"):
         table()

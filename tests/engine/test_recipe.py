@@ -100,6 +100,16 @@ def test_merge_goes_into_mappings() -> None:
     }
 
 
+def test_an_empty_mapping_takes_the_place_of_another(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text(
+        "extra_data: {more: 2}\nsampling: {timeofday: {night: 2}}\naugmentation: {flip: 0.1}\n"
+    )
+    (tmp_path / "b.yaml").write_text("base: a.yaml\nsampling: {}\naugmentation: {}\n")
+    config = read_recipe(tmp_path / "b.yaml")
+    assert config == TrainConfig(extra_data={"more": 2.0})
+    assert read_recipe(tmp_path / "b.yaml", {"extra_data": {}}) == TrainConfig()
+
+
 def test_the_recipes_of_bdd100k_are_the_papers() -> None:
     config = read_recipe(RECIPES / "bdd100k_tiny.yaml")
     assert (config.epochs, config.batch_size, config.lr, config.betas) == (200, 16, 0.001, (0.937, 0.999))

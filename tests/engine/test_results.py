@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,19 +38,48 @@ def test_page_shows_curves_facts_and_pictures(tmp_path: Path) -> None:
     assert shades == pytest.approx([40, 200], abs=3)
 
 
-@pytest.mark.parametrize(("lowest", "scale"), [(0.5, "log"), (0.0, "linear")])
-def test_losses_have_a_logarithmic_axis_where_all_have_a_logarithm(
-    lowest: float, scale: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("lane", "scale", "shown"),
+    [
+        ((0.5, 0.5), "log", 2),
+        ((0.0, 0.0), "log", 1),
+        ((0.5, 0.0), "log", 2),
+        ((math.nan, 0.5), "log", 2),
+        ((math.nan, 0.0), "log", 1),
+        ((0.5, -0.5), "linear", 2),
+    ],
+)
+def test_losses_have_a_logarithmic_axis_unless_one_is_negative(
+    lane: tuple[float, float], scale: str, shown: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     figure = pytest.importorskip("matplotlib.figure")
-    scales: list[str] = []
-    monkeypatch.setattr(figure.Figure, "savefig", lambda self, file, dpi: scales.append(self.axes[0].get_yscale()))
+    plots: list[tuple[str, int]] = []
+    limits: list[tuple[float, float]] = []
+
+    def savefig(self: Any, file: object, dpi: int) -> None:
+        (axes,) = self.axes
+        plots.append((axes.get_yscale(), len(axes.lines)))
+        limits.append(axes.get_ylim())
+
+    monkeypatch.setattr(figure.Figure, "savefig", savefig)
     logger = CsvLogger(tmp_path / "metrics.csv")
     for step in (1, 2):
-        logger.log({"train/total": step, "train/lane": lowest, "val/lane/iou": step / 10}, step)
+        loss = lane[step - 1]
+        total = math.nan if math.isnan(loss) else step  # where every step was left out, as are all terms
+        logger.log({"train/total": total, "train/lane": loss, "val/lane/iou": 0.0}, step)
     logger.close()
     write_results(tmp_path / "results", tmp_path / "metrics.csv", title="run", facts={})
-    assert scales == [scale, "linear"]
+    assert plots == [(scale, shown), ("linear", 1)]
+    assert scale == "linear" or limits[0][0] > 0.1  # a point without a logarithm widens no axis
+
+
+def test_losses_that_are_nothing_throughout_leave_an_empty_picture(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    logger = CsvLogger(tmp_path / "metrics.csv")
+    logger.log({"train/total": math.nan, "train/lane": 0.0}, 1)
+    logger.close()
+    page = write_results(tmp_path / "results", tmp_path / "metrics.csv", title="run", facts={})
+    assert (page.parent / "losses.png").is_file()
 
 
 def test_a_page_that_cannot_be_written_is_told(tmp_path: Path) -> None:

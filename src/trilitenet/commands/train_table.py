@@ -12,16 +12,16 @@ from trilitenet.commands.evaluate import evaluate, hash_dataset, known_report
 from trilitenet.commands.paths import StrPath
 from trilitenet.commands.tables import PAPER_COLUMNS, markdown_row
 from trilitenet.commands.train import train, training_data
-from trilitenet.config import parse_yaml, read_yaml
+from trilitenet.config import parse, parse_yaml, read_yaml
 from trilitenet.data.identity import identify, tell_apart
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.checkpoint import read_checkpoint
 from trilitenet.engine.recipe import TrainConfig, read_recipe
-from trilitenet.engine.train import CHECKPOINT_NAME
+from trilitenet.engine.train import CHECKPOINT_NAME, holds_run
 from trilitenet.errors import ConfigError, OutputError, brief
 from trilitenet.models.cost import count_multiply_adds, count_parameters
 from trilitenet.models.trilitenet import TriLiteNet
-from trilitenet.models.weights import load_network
+from trilitenet.models.weights import load_network, read_card
 
 __all__ = ["TableResult", "TableRow", "train_table"]
 
@@ -31,7 +31,7 @@ _FREE: Final = frozenset(
     {"data", "output", "device", "devices", "num_nodes", "workers", "compile"}
     | {"loggers", "log_every", "pictures", "checkpoint_every"}
 )
-"""Settings in which a row that is done may differ from what is asked for: the data's content is compared by itself."""
+"""Settings in which a row may differ from what is asked for: the data's content is compared by itself."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,14 +103,16 @@ def train_table(
         table: A YAML file with a title and rows: name -> recipe, relative to the file.
         data: Root folder of a data set in the published layout.
         output: Folder of the runs, a folder each.
-        resume: Go on with a row that was stopped; otherwise it starts anew.
+        resume: Go on with rows that were stopped, of which those without a checkpoint start anew; otherwise they are
+            refused.
         settings: Settings of every run that replace the recipes', in YAML: '{epochs: 10, workers: 4}'.
 
     Returns:
         The table.
 
     Raises:
-        OutputError: If a row that is done was trained with other settings or on other data.
+        OutputError: If a row that is done, or gone on with, was trained with other settings or on other data; if one
+            was stopped and is not gone on with.
     """
     title, recipes = _read(Path(table))
     more = parse_yaml(settings, "settings") if settings else {}
@@ -120,22 +122,19 @@ def train_table(
         )
     fields: dict[str, Any] = {str(name): value for name, value in more.items()} | {"data": str(Path(data))}
     configs = {name: read_recipe(recipe, fields) for name, recipe in recipes.items()}
-    for name, recipe in recipes.items():
-        folder = Path(output, recipe.stem)
-        if (folder / _WEIGHTS).is_file():
-            _check_done(folder, configs[name])
+    done = {name: _is_done(Path(output, recipe.stem), configs[name], resume=resume) for name, recipe in recipes.items()}
     rows: list[TableRow] = []
     first = True
     for name, recipe in recipes.items():
         folder = Path(output, recipe.stem)
         weights = folder / _WEIGHTS
-        finished = weights.is_file()
-        if not finished:
+        if not done[name]:
             going_on = resume and (folder / CHECKPOINT_NAME).is_file()
-            result = train(recipe, resume=going_on, overwrite=not going_on, **fields, output=str(folder))
-            finished, first = result.finished, result.first
-        if not finished:
-            break
+            anew = resume and not going_on  # it was killed before its first checkpoint
+            result = train(recipe, resume=going_on, overwrite=anew, **fields, output=str(folder))
+            first = result.first
+            if not result.finished:
+                break
         network = load_network(weights, configs[name].network)
         figures = _measure(weights, network, configs[name]) if first else {}
         rows.append(
@@ -175,23 +174,51 @@ def _measure(weights: Path, network: TriLiteNet, config: TrainConfig) -> dict[st
     return {name: value for name, value in figures.items() if not math.isnan(value)}  # as of a task without labels
 
 
-def _check_done(folder: Path, config: TrainConfig) -> None:
+def _is_done(folder: Path, config: TrainConfig, *, resume: bool) -> bool:
+    """Return whether a row is done.
+
+    Raises:
+        OutputError: If it can neither be taken as it is nor gone on with.
+    """
+    weights, checkpoint = folder / _WEIGHTS, folder / CHECKPOINT_NAME
+    state = read_checkpoint(checkpoint) if checkpoint.is_file() else None
+    done = weights.is_file()
+    if done and state is not None:  # they may be older: of a run that went on for more epochs, and was stopped
+        done = read_card(weights).provenance.get("steps") == str(state["step"])
+    if not (done or resume) and holds_run(folder):
+        raise OutputError(
+            f"{folder}: holds a run that was stopped; --resume goes on with it, or remove the folder to train it anew"
+        )
+    if done or state is not None:
+        _check_trained(folder, config, state)
+    return done
+
+
+def _check_trained(folder: Path, config: TrainConfig, state: dict[str, Any] | None) -> None:
     """Refuse a row that was trained with other settings or on other data than it would be now.
+
+    Args:
+        folder: Of the row.
+        config: What is asked for now.
+        state: Its checkpoint; None without one.
 
     Raises:
         OutputError: If so, or if that cannot be told.
     """
     cure = "give another --output, or remove the folder to train it anew"
     try:
-        old, new = (_flat(settings.to_dict()) for settings in (read_recipe(folder / "config.yaml"), config))
+        told = [read_recipe(folder / "config.yaml")]
+        if state is not None:  # whose settings are others where the run went on and was killed before it was saved
+            told.append(parse(TrainConfig, state["config"], str(folder / CHECKPOINT_NAME)))
     except ConfigError as error:
         raise OutputError(f"{folder}: what it was trained with cannot be told ({error}); {cure}") from error
-    for name in sorted((old.keys() | new.keys()) - _FREE):
-        if old.get(name) != new.get(name):
-            asked = f"was trained with {name} {old.get(name)!r}, now {new.get(name)!r} is asked for"
-            raise OutputError(f"{folder}: {asked}; {cure}")
-    checkpoint = folder / CHECKPOINT_NAME
-    identity = read_checkpoint(checkpoint)["data"] if checkpoint.is_file() else None
+    new = _flat(config.to_dict())
+    for old in (_flat(settings.to_dict()) for settings in told):
+        for name in sorted((old.keys() | new.keys()) - _FREE):
+            if old.get(name) != new.get(name):
+                asked = f"was trained with {name} {old.get(name)!r}, now {new.get(name)!r} is asked for"
+                raise OutputError(f"{folder}: {asked}; {cure}")
+    identity = state["data"] if state is not None else None
     difference = tell_apart(identity, identify(training_data(config)), strict=True) if identity else None
     if difference:
         raise OutputError(f"{folder}: was trained on {difference}; {cure}")

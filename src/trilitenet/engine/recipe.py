@@ -24,11 +24,13 @@ class TrainConfig:
 
     Attributes:
         data: Root folder of a data set in the published layout.
-        extra_data: Root folders of further data sets to train on, each with the weight its images are drawn by.
+        extra_data: Root folders of further data sets to train on, each with the weight its images are drawn by; {} for
+            none.
         train_split: Split to train on.
         val_split: Split to validate on; empty for none.
         classes: Names of the detection classes; those of the data set if left out.
-        sampling: Attribute -> value -> how often such an image is drawn, for example timeofday: {night: 2}.
+        sampling: Attribute -> value -> how often such an image is drawn, for example timeofday: {night: 2}; {} for all
+            alike.
         samples_per_epoch: Images an epoch; all of them if left out.
         input_size: (height, width) in pixels, multiples of 32 (Section IV-A: 640x384).
         augmentation: Strengths of the random transforms.
@@ -61,8 +63,9 @@ class TrainConfig:
             code: on).
         final_lr: The cosine ends at this fraction of ``lr`` (published code: 0.2).
         cosine_steps: Lower the rate after each step, or after each epoch as the published code does.
-        warmup_epochs: Linear warm-up takes this long, or ``warmup_steps`` if that is longer (published code: 3).
-        warmup_steps: See ``warmup_epochs`` (published code: 1000).
+        warmup_epochs: Linear warm-up takes this long, or ``warmup_steps`` if that is longer (published code: 3); 0 for
+            none, whatever ``warmup_steps``.
+        warmup_steps: See ``warmup_epochs`` (published code: 1000); no warm-up where that is 0.
         clip_gradient: Largest norm of the whole gradient; 0 for no limit (the publication has none).
         ema_decay: Of the moving average of the weights; 0 switches it off (published code: 0.9999).
         ema_ramp: The decay rises as 1 - exp(-updates / ramp) (published code: 2000).
@@ -212,11 +215,11 @@ class TrainConfig:
 
 
 def merge(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ``first`` with the values of ``second`` laid over it, mappings within mappings alike."""
+    """Return ``first`` with the values of ``second`` laid over it, mappings within mappings alike unless empty."""
     merged = dict(first)
     for key, value in second.items():
         old = merged.get(key)
-        merged[key] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+        merged[key] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) and value else value
     return merged
 
 
@@ -225,7 +228,8 @@ def read_recipe(path: str | Path | None, overrides: Mapping[str, Any] | None = N
 
     Args:
         path: A YAML file of `TrainConfig` keys; key ``base`` names another recipe to start from. None = defaults.
-        overrides: Key -> value, laid over the file; mappings within mappings alike.
+        overrides: Key -> value, laid over the file; mappings within mappings alike. An empty mapping, here or in a
+            recipe, takes the place of what it is laid over: no extra_data, no sampling, the default augmentation.
 
     Raises:
         ConfigError: If it cannot be read, or on an unknown key (naming the nearest) or a wrong value.

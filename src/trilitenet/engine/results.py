@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import io
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -91,17 +92,24 @@ def write_results(
 def _plot(curves: Mapping[str, tuple[list[int], list[float]]], *, log: bool) -> bytes:
     """Return a PNG."""
     module: Any = import_extra("matplotlib.figure", "train")
+    if log:  # of a term that is 0 throughout, as of a task that is not trained, there is nothing to see
+        curves = {
+            name: (steps, values)
+            for name, (steps, values) in curves.items()
+            if any(value != 0 and math.isfinite(value) for value in values)
+        }
     figure = module.Figure(figsize=(10, 5), layout="constrained")
     axes = figure.add_subplot()
     for name, (steps, values) in curves.items():
         axes.plot(steps, values, label=name, marker="o" if len(steps) < 30 else None, markersize=3)
-    if log and all(value > 0 for _, values in curves.values() for value in values):
+    finite = [value for _, values in curves.values() for value in values if math.isfinite(value)]
+    if log and finite and min(finite) >= 0:  # with learned weights the total may be below
         axes.set_yscale("log")
-        highest = max(max(values) for _, values in curves.values())
-        axes.set_ylim(bottom=max(axes.get_ylim()[0], highest / 1e4))  # a term next to nothing flattens no other
+        axes.set_ylim(bottom=max(axes.get_ylim()[0], max(finite) / 1e4))  # a term next to nothing flattens no other
     axes.set_xlabel("step")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))  # beside the curves, over none of them
+    if curves:
+        axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))  # beside the curves, over none of them
     picture = io.BytesIO()
     figure.savefig(picture, dpi=100)
     return picture.getvalue()

@@ -440,8 +440,8 @@ class Trainer:
     def _end_epoch(self, epoch: int, stop: StopRequest) -> None:
         """Validate, keep the best, save, but at the end of the run, which does that itself.
 
-        A validation is left if a wish to stop comes meanwhile; a run that goes on does it anew, and that alone: the
-        state is saved before, too.
+        A validation is left if a wish to stop comes meanwhile; a run that goes on does it anew, and that alone: where
+        ``checkpoint_every`` has the epoch saved, the state is saved before, too.
         """
         last = self.step >= self.steps
         saved = last or (epoch + 1) % self.config.checkpoint_every == 0
