@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import math
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -128,10 +131,10 @@ def test_calibrates_itself_from_the_lanes(drive: tuple[Scene, ...]) -> None:
     truth = drive[0].truth
     calibration = SelfCalibration(drive[0].sample.size, field_of_view=60.0, lane_width=truth.lane_width)
     for scene in drive[:6]:
-        calibration.update(_positioned(scene))
+        calibration.update(_positioned(scene), scene.truth.timestamp)
     assert calibration.camera is None  # a few frames do not convince it
     for scene in drive[6:25]:
-        calibration.update(_positioned(scene))
+        calibration.update(_positioned(scene), scene.truth.timestamp)
     camera = calibration.camera
     assert camera is not None
     assert camera.pitch == pytest.approx(truth.camera.pitch, abs=0.003)
@@ -143,8 +146,8 @@ def test_calibrates_itself_from_the_lanes(drive: tuple[Scene, ...]) -> None:
 
 def test_stays_unsure_without_lanes() -> None:
     calibration = SelfCalibration((360, 640))
-    for _ in range(50):
-        calibration.update([])
+    for frame in range(50):
+        calibration.update([], frame / 25)
     assert calibration.camera is None
     with pytest.raises(ConfigError, match="lane width"):
         SelfCalibration((360, 640), lane_width=0.0)
@@ -157,6 +160,84 @@ def test_the_view_goes_there_and_back() -> None:
     np.testing.assert_allclose((pixels @ view.matrix.T)[:, :2], points)
 
 
+@functools.cache
+def _seen(heading: float) -> list[LaneLine]:
+    """Return the lines of a straight lane as a car sees them that points so many radians to its left."""
+    mounted = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03, yaw=heading)
+    mask = np.zeros(mounted.size, np.uint8)
+    ahead = np.linspace(5.0, 60.0, 100)
+    for side in (1.75, -1.75):
+        pixels = mounted.to_pixels(np.stack([ahead, np.full_like(ahead, side)], axis=1))
+        cv2.polylines(mask, [np.round(pixels * 16).astype(np.int32)], False, 1, 3, shift=4)
+    lines = find_lines(mask)
+    return assign_positions(lines, [float(line.column(359.0)) - 319.5 for line in lines])
+
+
+def _drive(rate: int, seconds: float, heading: Callable[[float], float]) -> list[tuple[float, float]]:
+    """Return the yaw and its error of each frame once there is a camera that looks straight ahead."""
+    calibration, found = SelfCalibration((360, 640)), []
+    for frame in range(round(seconds * rate)):
+        calibration.update(_seen(round(heading(frame / rate), 3)), frame / rate)
+        if calibration.camera is not None:
+            found.append((calibration.camera.yaw, calibration.errors.yaw))
+    return found
+
+
+@pytest.mark.parametrize("rate", [10, 25, 60, 120])
+def test_a_change_of_lanes_is_not_taken_for_yaw(rate: int) -> None:
+    found = _drive(rate, 14.0, lambda now: 0.05 * math.sin(math.pi * (now - 8) / 4.5) if 8 < now < 12.5 else 0.0)
+    assert len(found) == round(14.0 * rate) - SelfCalibration.NEEDED + 1
+    assert max(abs(yaw) for yaw, _ in found) < 0.012
+    assert max(abs(yaw) / error for yaw, error in found) < 2
+
+
+def _wander(now: float) -> float:
+    return 0.006 * math.sin(1.3 * now)
+
+
+@pytest.mark.parametrize(("drive", "stop"), [(5, 12), (10, 60)])
+@pytest.mark.parametrize("aside", [0.02, 0.06])
+def test_a_stop_is_not_taken_for_yaw(drive: int, stop: int, aside: float) -> None:
+    found = _drive(25, drive + stop + 5, lambda now: aside if drive < now <= drive + stop else _wander(now))
+    assert max(abs(yaw) for yaw, _ in found) < 0.012
+    assert max(abs(yaw) / error for yaw, error in found[25:]) < 2
+
+
+def test_a_clip_that_begins_with_a_stop_is_made_good_by_the_drive() -> None:
+    found = _drive(25, 60, lambda now: 0.03 if now < 30 else _wander(now))
+    assert found[29 * 25][0] == pytest.approx(0.03, abs=0.004)
+    assert abs(found[-1][0]) < 0.004
+    found = _drive(25, 60, lambda now: 0.03 if now < 5 else 0.0)  # as if painted: lines that do not move again
+    assert abs(found[-1][0]) < 0.004
+
+
+def test_the_error_of_the_yaw_knows_of_two_headings() -> None:
+    found = _drive(25, 12, lambda now: 0.03 if now < 5 else _wander(now))
+    assert max(min(abs(yaw), abs(yaw - 0.03)) / error for yaw, error in found) < 2
+    assert max(error for _, error in found) > 0.012
+
+
+def test_a_clock_that_is_set_back_does_not_stop_the_calibration() -> None:
+    calibration = SelfCalibration((360, 640))
+    for frame in range(20):
+        calibration.update(_seen(0.03), 100 + frame / 25)
+    for frame in range(100):
+        calibration.update(_seen(round(_wander(frame / 25), 3)), frame / 25)
+    assert calibration.camera is not None
+    assert calibration.camera.yaw == pytest.approx(0.0, abs=0.01)
+
+
+def test_bends_count_by_time_too() -> None:
+    calibration = SelfCalibration((360, 640))
+    for frame in range(60):
+        calibration.update(_seen(round(_wander(frame / 25), 3)), frame / 25)
+        calibration.see_bend(0.0)
+    for frame in range(600):
+        calibration.update(_seen(0.0), 60 / 25 + frame / 1000)
+        calibration.see_bend(0.004)
+    assert calibration.errors.yaw < 0.015
+
+
 def test_a_camera_that_looks_to_the_left_is_told_so() -> None:
     mounted = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03, yaw=0.05)
     mask = np.zeros(mounted.size, np.uint8)
@@ -166,7 +247,7 @@ def test_a_camera_that_looks_to_the_left_is_told_so() -> None:
         cv2.polylines(mask, [np.round(pixels).astype(np.int32)], False, 1, 3)
     lines = find_lines(mask)
     calibration = SelfCalibration(mounted.size, still=True)
-    calibration.update(assign_positions(lines, [float(line.column(359.0)) - 319.5 for line in lines]))
+    calibration.update(assign_positions(lines, [float(line.column(359.0)) - 319.5 for line in lines]), 0.0)
     assert calibration.camera is not None
     assert calibration.camera.yaw == pytest.approx(0.05, abs=0.01)
     assert calibration.camera.pitch == pytest.approx(0.03, abs=0.01)

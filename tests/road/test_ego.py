@@ -194,6 +194,46 @@ def test_the_error_of_a_closing_speed_holds_while_the_lead_brakes(rate: int, bra
     assert found.closing_speed.error < LeadFilter.MAX_SPEED_ERROR
 
 
+@pytest.mark.parametrize("rate", [5, 25, 60])
+@pytest.mark.parametrize("speed", [8, 20, 30])
+def test_a_fast_approach_is_told_in_time(rate: int, speed: int) -> None:
+    """A camera's error, which is a share of the speed, must not hide it."""
+    leads, boxes = LeadFilter(), standing((30.0, 0.0))
+    for frame in range(2 * rate + 1):
+        true = 4.8 * speed - speed * frame / rate
+        found = leads.update(LeadVehicle(0, 3, Estimate(1.1 * true, 0.2 * true)), boxes, frame / rate, CAMERA, 0, 0.15)
+    assert found is not None
+    assert found.closing_speed is not None
+    assert abs(found.closing_speed.value - speed) < 2 * found.closing_speed.error
+    assert found.time_to_collision is not None
+    assert found.time_to_collision.value == pytest.approx(2.8, abs=0.15)
+
+
+def test_the_error_of_a_time_to_collision_has_what_is_not_in_the_speed_alike() -> None:
+    tilt = 0.004 / CAMERA.height  # radians, seen as a share of the distance that grows with it
+    for scale, off in ((0.15, 0.0), (0.0, tilt)):
+        leads, boxes = LeadFilter(), standing((30.0, 0.0))
+        for frame in range(51):
+            true = 144 - 30 * frame / 25
+            distance = true * (1 + scale + off * true)
+            lead = LeadVehicle(0, 3, Estimate(distance, true * (scale + off * true)))
+            found = leads.update(lead, boxes, frame / 25, CAMERA, 0.0, scale)
+        assert found is not None
+        assert found.time_to_collision is not None
+        left = found.time_to_collision
+        assert abs(left.value - true / 30) < 2 * left.error
+        assert (left.error > 0.4) == (off > 0)
+
+
+def test_a_speed_that_may_be_noise_is_not_told() -> None:
+    rng, leads, boxes = np.random.default_rng(0), LeadFilter(), standing((30.0, 0.0))
+    for frame in range(200):
+        lead = LeadVehicle(0, 3, Estimate(100 + rng.normal(0, 5), 20))
+        found = leads.update(lead, boxes, frame / 10, CAMERA)
+        assert found is not None
+        assert found.closing_speed is None
+
+
 def test_a_bump_is_not_taken_for_speed() -> None:
     boxes = standing((30.0, 0.0))
     told: dict[bool, list[float]] = {True: [], False: []}

@@ -16,10 +16,11 @@ from trilitenet.data.synthetic import Scene
 from trilitenet.errors import ShapeError
 from trilitenet.processing.geometry import Camera
 from trilitenet.road.camera import CameraErrors
+from trilitenet.road.ego import REAR_OVERHANG
 from trilitenet.road.monitor import RoadMonitor
 from trilitenet.road.structures import EgoLane, Road
 from trilitenet.road.tracking import Steady
-from trilitenet.structures import Perception
+from trilitenet.structures import Boxes, Perception
 
 Perceive = Callable[[Scene], Perception]
 
@@ -270,3 +271,26 @@ def test_the_width_of_a_lane_is_learnt_and_forgotten_by_time(rate: int) -> None:
     now += 600  # another road
     lane = see(1 / rate, -1.4)
     assert lane is None or (lane.width, lane.offset) == (None, None)
+
+
+@pytest.mark.parametrize("given", [True, False])
+@pytest.mark.parametrize("speed", [8, 20, 30])
+def test_a_standing_vehicle_is_warned_of_however_fast_it_comes(given: bool, speed: int) -> None:
+    camera = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03)
+    monitor = RoadMonitor(camera if given else None)
+    empty = marked(camera, 1.75, -1.75)
+    begun = None
+    for frame in range(-15, 70):
+        left = 5.0 - max(frame, 0) / 25  # seconds
+        feet = np.array([[speed * left + REAR_OVERHANG, 0.9], [speed * left + REAR_OVERHANG, -0.9]])
+        (start, foot), (end, _) = camera.to_pixels(feet) + 0.5
+        box = np.array([[start, foot - 0.83 * (end - start), end, foot]], np.float32)
+        boxes = Boxes(box, np.full(1, 0.9, np.float32), np.zeros(1, np.int64), np.zeros(1, np.int64))
+        road = monitor(dataclasses.replace(empty, boxes=boxes if frame >= 0 else None, timestamp=(frame + 15) / 25))
+        if road.warnings and begun is None:
+            begun = left
+            assert road.warnings == ("forward_collision",)
+            assert road.lead is not None
+            assert road.lead.time_to_collision is not None
+            assert abs(road.lead.time_to_collision.value - left) < 2 * road.lead.time_to_collision.error
+    assert begun == pytest.approx(2.55, abs=0.07 if given else 0.15)

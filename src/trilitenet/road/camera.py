@@ -18,7 +18,7 @@ from trilitenet.config import parse, parse_yaml
 from trilitenet.errors import ConfigError, write_file
 from trilitenet.processing.geometry import Camera
 from trilitenet.road.lanes import vanishing_point
-from trilitenet.road.structures import LaneLine
+from trilitenet.road.structures import LATE, LaneLine
 
 __all__ = ["CameraErrors", "SelfCalibration", "View", "read_camera", "write_camera"]
 
@@ -159,7 +159,8 @@ class SelfCalibration:
     """Estimates how the camera is mounted from the lanes alone.
 
     Pitch and yaw follow from where they vanish, the height from the width of a lane. It trusts itself once enough
-    frames agree.
+    frames agree. From then on it takes in frames by time, and few of lines that do not move: the car may stand, and not
+    along the lane.
 
     The focal length cannot be seen from lanes: it follows from the assumed field of view, and its uncertainty goes into
     every distance. Offsets across the lane do not depend on it. Roll is taken to be 0, and lines to be straight: what a
@@ -174,7 +175,13 @@ class SelfCalibration:
     """
 
     WINDOW: Final = 250
-    """Frames that are remembered."""
+    """Frames that are remembered, of those taken in."""
+    INTERVAL: Final = 0.1
+    """Seconds between frames that are taken in, once there is a camera."""
+    UNMOVED: Final = 30
+    """Frames that are taken in so while the lines vanish in one place; then they are rarer."""
+    UNMOVED_INTERVAL: Final = 2.0
+    """Seconds between those."""
     NEEDED: Final = 12
     """Frames with a vanishing point before it is trusted."""
     FOCAL_ERROR: Final = 0.15
@@ -197,15 +204,35 @@ class SelfCalibration:
         self._points: deque[tuple[float, float, float]] = deque(maxlen=self.WINDOW)
         self._spreads: deque[float] = deque(maxlen=self.WINDOW)
         self._bends: deque[float] = deque(maxlen=self.WINDOW)
+        self._last = -math.inf
+        self._taken = False
+        self._place: tuple[float, float] = (math.inf, math.inf)
+        self._unmoved = 0
         self.camera: Camera | None = None
         self.errors = CameraErrors()
 
-    def update(self, lines: Sequence[LaneLine]) -> None:
-        """Take in the lines of one frame, with their positions (see `assign_positions`) where known."""
+    def update(self, lines: Sequence[LaneLine], timestamp: float) -> None:
+        """Take in the lines of one frame.
+
+        Args:
+            lines: With their positions (see `assign_positions`) where known.
+            timestamp: Seconds.
+        """
+        self._taken = False
+        step = timestamp - self._last
+        if self.camera is not None and -LATE <= step < self.INTERVAL - 1e-6:
+            return
         found = vanishing_point(lines, self.size)
         height = self.size[0]
         if found is None or found.error > 0.03 * height or not 0.1 * height < found.v < 0.75 * height:
             return
+        if math.dist((found.u, found.v), self._place) > found.error:
+            self._place, self._unmoved = (found.u, found.v), 0
+        if self.camera is not None:
+            if self._unmoved >= self.UNMOVED and -LATE <= step < self.UNMOVED_INTERVAL - 1e-6:
+                return
+            self._unmoved += 1
+        self._last, self._taken = timestamp, True
         self._points.append((found.u, found.v, found.error))
         left = next((line for line in lines if line.position == -1), None)
         right = next((line for line in lines if line.position == 1), None)
@@ -217,8 +244,9 @@ class SelfCalibration:
         self._solve()
 
     def see_bend(self, curvature: float) -> None:
-        """Take in the curvature of one frame's lane in 1/m: what most frames bend by may be in the yaw."""
-        self._bends.append(curvature)
+        """Take in the curvature in 1/m of the last frame's lane: what most frames bend by may be in the yaw."""
+        if self._taken:
+            self._bends.append(curvature)
 
     def _solve(self) -> None:
         points = np.array(self._points)
@@ -228,7 +256,10 @@ class SelfCalibration:
             return
         u, v = np.median(points[:, 0]), np.median(points[:, 1])
         count = len(points)
-        scatter = 1.48 * np.median(np.abs(points[:, :2] - (u, v)), axis=0) / math.sqrt(max(count / 5, 1.0))
+        # Every five frames count as one; so far by rank may the middle of all there could be lie from that of these.
+        ranks = 0.5 + np.array([-0.5, 0.5]) / math.sqrt(max(count / 5, 1.0))
+        low, high = np.quantile(points[:, :2], ranks, axis=0)
+        scatter = (high - low) / 2
         row_error = math.hypot(float(scatter[1]), float(np.median(points[:, 2])) / math.sqrt(count))
         focal = self._level.fy
         pitch = math.atan((self._level.cy - v) / focal)

@@ -449,11 +449,16 @@ class LeadFilter:
     """How much the closing speed wanders in a second, in m/s: an acceleration taken to last about so long."""
     BOX_NOISE: Final = 0.5
     """The part of `BOX_ERROR` that differs from frame to frame, in pixels."""
+    ANY_SPEED: Final = 30.0
+    """Standard deviation of the closing speed before any is known, in m/s."""
     GAP: Final = 0.6
     """Seconds without the vehicle after which it is forgotten."""
     NEEDED: Final = 0.5
     """Seconds of watching before a speed is told."""
     MAX_SPEED_ERROR: Final = 2.0
+    """Of the speed as it is followed, in m/s: what the camera errs by grows with the speed and must not hide it."""
+    MAX_SPEED_SHARE: Final = 0.2
+    """Or so large a share of the speed, if that is more."""
     MAX_TIME: Final = 30.0
 
     def __init__(self) -> None:
@@ -464,7 +469,13 @@ class LeadFilter:
         self._last = self._since = 0.0
 
     def update(
-        self, lead: LeadVehicle | None, boxes: Boxes, timestamp: float, camera: Camera, shaken: float = 0.0
+        self,
+        lead: LeadVehicle | None,
+        boxes: Boxes,
+        timestamp: float,
+        camera: Camera,
+        shaken: float = 0.0,
+        scale: float = 0.0,
     ) -> LeadVehicle | None:
         """Return the lead with what its history tells.
 
@@ -474,6 +485,7 @@ class LeadFilter:
             timestamp: Seconds.
             camera: The camera.
             shaken: Metres, of the error of the distance: what this frame adds to it, as the pitch of a bump does.
+            scale: Share of the distance, of its error: what is in the speed alike, and so not in the time to collision.
         """
         if lead is None:
             return None
@@ -489,7 +501,7 @@ class LeadFilter:
             self._advance(step, lead.distance.value, noise)
         elif not same:
             self._state = np.array([lead.distance.value, 0.0])
-            self._covariance = np.diag([noise**2, 15.0**2])
+            self._covariance = np.diag([noise**2, self.ANY_SPEED**2])
             self._since = timestamp
         if not late:
             self._last, self._identity, self._box = timestamp, lead.track_id, box
@@ -498,16 +510,16 @@ class LeadFilter:
         spread = math.sqrt(max(self._covariance[0, 0], 0.0))
         systematic = math.sqrt(max(lead.distance.error**2 - noise**2, 0.0))
         found = Estimate(distance, math.hypot(spread, systematic))
-        speed_error = math.hypot(math.sqrt(self._covariance[1, 1]), rate * systematic / max(distance, 1.0))
-        if self._last - self._since < self.NEEDED or speed_error > self.MAX_SPEED_ERROR:
+        rate_spread = math.sqrt(max(self._covariance[1, 1], 0.0))
+        limit = max(self.MAX_SPEED_ERROR, self.MAX_SPEED_SHARE * abs(rate))
+        if self._last - self._since < self.NEEDED or rate_spread > limit:
             return dataclasses.replace(lead, distance=found)
-        closing = Estimate(-rate, speed_error)
+        closing = Estimate(-rate, math.hypot(rate_spread, rate * systematic / max(distance, 1.0)))
         left = None
-        if closing.value > max(0.5, 2 * closing.error) and distance / closing.value < self.MAX_TIME:
-            time = distance / closing.value
-            left = Estimate(
-                time, time * math.hypot(spread / distance, math.sqrt(self._covariance[1, 1]) / closing.value)
-            )
+        if -rate > max(0.5, 2 * rate_spread) and distance / -rate < self.MAX_TIME:
+            time = distance / -rate
+            uneven = math.sqrt(max(systematic**2 - (scale * distance) ** 2, 0.0))
+            left = Estimate(time, time * math.hypot(spread / distance, rate_spread / rate, uneven / distance))
         return dataclasses.replace(lead, distance=found, closing_speed=closing, time_to_collision=left)
 
     def _is_same(self, lead: LeadVehicle, box: NDArray[np.float32]) -> bool:

@@ -88,12 +88,12 @@ class RoadMonitor:
         if camera is None:
             lines = assign_positions(lines, [_column_right(line, perception.size) for line in lines])
             if self._calibration is not None:
-                self._calibration.update(lines)
+                self._calibration.update(lines, timestamp)
             return self._with_events(Road(tuple(lines), drivable), perception, timestamp)
         lines = [dataclasses.replace(line, ground=ground_curve(line, camera)) for line in lines]
         lines = assign_positions(lines, [_metres_right(line) for line in lines])
         if self._calibration is not None:
-            self._calibration.update(lines)
+            self._calibration.update(lines, timestamp)
         distances = () if perception.boxes is None else find_distances(perception.boxes, camera, errors)
         road = Road(tuple(lines), drivable, camera=camera, calibrated=calibrated, distances=distances)
         usual = CameraErrors() if self._calibration is None else self._calibration.errors
@@ -102,7 +102,7 @@ class RoadMonitor:
         if fit is not None:
             if self._calibration is not None and fit.lane.curvature is not None:
                 self._calibration.see_bend(fit.lane.curvature.value)
-            road = self._with_lane(road, fit, perception, timestamp, None if errors == usual else usual)
+            road = self._with_lane(road, fit, perception, timestamp, usual, shaken=errors != usual)
         return self._with_events(road, perception, timestamp)
 
     def _prepare(self, size: tuple[int, int]) -> None:
@@ -132,7 +132,8 @@ class RoadMonitor:
             calibration = self._calibration
             assert calibration is not None
             if self._still:
-                calibration.update(assign_positions(lines, [_column_right(line, calibration.size) for line in lines]))
+                where = [_column_right(line, calibration.size) for line in lines]
+                calibration.update(assign_positions(lines, where), 0.0)
             if calibration.camera is None:
                 return None, CameraErrors(), None
             camera, errors = calibration.camera, calibration.errors
@@ -161,9 +162,9 @@ class RoadMonitor:
         self._width_seen = timestamp
 
     def _with_lane(
-        self, road: Road, fit: LaneFit, perception: Perception, timestamp: float, usual: CameraErrors | None
+        self, road: Road, fit: LaneFit, perception: Perception, timestamp: float, usual: CameraErrors, *, shaken: bool
     ) -> Road:
-        """Add the lane and the lead; ``usual`` is how well the camera is known where this frame's errors are others."""
+        """Add the lane and the lead; ``usual`` is how well the camera is known where it is not shaken as in a frame."""
         camera = road.camera
         assert camera is not None
         if fit.lane.width is not None:
@@ -172,9 +173,10 @@ class RoadMonitor:
         if perception.boxes is not None:
             lead = find_lead(perception.boxes, road.distances, fit, camera)
             if lead is not None and not self._still:
-                calm = None if usual is None else find_distances(perception.boxes, camera, usual)[lead.box]
-                shaken = 0.0 if calm is None else math.sqrt(max(lead.distance.error**2 - calm.error**2, 0.0))
-                lead = self._lead.update(lead, perception.boxes, timestamp, camera, shaken)
+                calm = find_distances(perception.boxes, camera, usual)[lead.box] if shaken else None
+                added = 0.0 if calm is None else math.sqrt(max(lead.distance.error**2 - calm.error**2, 0.0))
+                scale = math.hypot(usual.height, usual.focal)
+                lead = self._lead.update(lead, perception.boxes, timestamp, camera, added, scale)
         lane = fit.lane if self._still else self._lane.update(fit, timestamp)
         if lane.width is None and lane.offset is not None:
             lane = dataclasses.replace(lane, width=self._known_width(timestamp))
