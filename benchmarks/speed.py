@@ -204,10 +204,9 @@ def main() -> None:
     results = {}
     with tempfile.TemporaryDirectory() as folder:
         for weights in arguments.weights:
-            variant = load_network(weights).card.variant
-            results[variant] = measure(weights, arguments, Path(folder))
-            print(f"{variant}: milliseconds p10, p50, p99; plain / own, in calm")
-            for name, row in results[variant].items():
+            results[weights] = measure(weights, arguments, Path(folder))
+            print(f"{weights}: milliseconds p10, p50, p99; plain / own, in calm")
+            for name, row in results[weights].items():
                 times = " ".join(f"{row[key]:8.2f}" for key in ("p10", "p50", "p99"))
                 print(f"  {name:45s} {times}  {row['ratio']:5.2f}  {row['calm']:5.2f}", flush=True)
     if arguments.output:

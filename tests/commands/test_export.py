@@ -75,6 +75,13 @@ def test_options_that_do_not_fit(artefacts: Artefacts, tmp_path: Path) -> None:
         ({"format": "ncnn", "precision": "bf16"}, "ncnn artefacts come as fp32, fp16, not bf16"),
         ({"format": "ncnn", "size": "dynamic"}, "ncnn needs a fixed --size"),
         ({"format": "executorch", "size": "dynamic"}, "executorch needs a fixed --size"),
+        ({"portable": True, "size": "dynamic"}, "--portable needs a fixed --size"),
+        ({"format": "torch", "portable": True, "size": "dynamic"}, "--portable needs a fixed --size"),
+        ({"portable": True, "precision": "fp16"}, "--portable keeps to operators that fp16 needs more than"),
+        (
+            {"format": "triton", "portable": True, "precision": "int8", "calibration": tmp_path},
+            "--portable keeps to operators that int8 needs more than",
+        ),
         ({"format": "executorch", "precision": "fp16"}, "executorch artefacts come as fp32, int8, not fp16"),
         ({"format": "ncnn", "mask_scale": 2}, "--mask-scale doubles masks that are decided"),
         ({"format": "ncnn", "output": tmp_path / "a.param"}, "end with .ncnn.param"),
@@ -92,6 +99,12 @@ def test_options_that_do_not_fit(artefacts: Artefacts, tmp_path: Path) -> None:
     (tmp_path / "a.onnx").touch()
     with pytest.raises(OutputError, match="exists already"):
         export(weights, output=tmp_path / "a.onnx")
+
+
+def test_an_engine_is_not_called_onnx(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "is_installed", lambda: True)
+    with pytest.raises(ConfigError, match=r"tensorrt artefacts end with \.engine, not \.onnx"):
+        export("tiny", format="tensorrt", output=tmp_path / "a.onnx")
 
 
 def test_pictures_are_never_masks(tmp_path: Path) -> None:
@@ -129,6 +142,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Predictor:
     network = build_network("tiny", tasks=("lane",))
     save_network(network, folder / "lane.safetensors", network.card)
     made = export(str(folder / "lane.safetensors"), format="torch", size="dynamic", output=folder / "a.pt2")
+    assert "input any multiple of 32 from 64 to 4096 RGB" in made.summary()
     return trilitenet.load(made.path)
 
 
@@ -150,10 +164,11 @@ def test_a_program_runs_on_another_device_than_it_was_exported_on(program: Predi
     assert (mask.shape, mask.device.type) == ((1, 96, 128), "meta")
 
 
-def test_a_dynamic_program_says_how_small_a_side_may_be(program: Predictor) -> None:
-    program.backend.run(np.zeros((1, 64, 96, 3), np.uint8))
-    for size in ((32, 96), (96, 32)):
-        with pytest.raises(ShapeError, match="takes sides from 64 pixels"):
+def test_a_dynamic_program_says_how_small_and_large_a_side_may_be(program: Predictor) -> None:
+    for size in ((64, 96), (64, 4096)):
+        program.backend.run(np.zeros((1, *size, 3), np.uint8))
+    for size in ((32, 96), (96, 32), (4128, 64), (64, 4128)):
+        with pytest.raises(ShapeError, match="takes sides from 64 pixels to 4096"):
             program.backend.run(np.zeros((1, *size, 3), np.uint8))
 
 
@@ -303,6 +318,34 @@ def test_an_artefact_is_compared_on_the_pictures_asked_for(
     assert kept == [Path("a"), Path("b"), None]
 
 
+def test_int8_is_not_judged_by_the_frames_that_it_was_calibrated_on_alone(
+    artefacts: Artefacts, tmp_path: Path, frames: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept: list[int] = []
+    monkeypatch.setattr(command, "build_onnx", lambda *_, **__: None)
+    monkeypatch.setattr(command, "_export_int8", lambda *arguments: kept.append(len(arguments[4])))
+    weights, dataset = str(artefacts.folder / "weights.safetensors"), tmp_path / "data"
+    write_dataset(dataset, "train", 1, 0, size=(32, 64))
+    write_dataset(dataset, "val", 3, 0, size=(32, 64))
+    options: tuple[dict[str, Any], ...] = (
+        {"calibration": frames},
+        {"calibration": frames, "frames": frames},
+        {"calibration": dataset},
+        {"calibration": dataset / "images" / "train"},
+    )
+    for option in options:
+        export(weights, precision="int8", size="64x128", output=tmp_path / "a.onnx", **option)
+    assert kept == [2 + 4, 2, 3, 1 + 4]
+
+
+def test_the_drop_needs_labels_before_frames_are_read(tmp_path: Path) -> None:
+    (tmp_path / "broken.png").touch()
+    info = ArtefactInfo("onnx", "int8", (32, 64))
+    arguments: tuple[Any, ...] = (None, None, info, tmp_path / "a.onnx", [], tmp_path, 500, 1.0)
+    with pytest.raises(ConfigError, match=r"--max-drop needs labels; .* is not a data set with a val split"):
+        command._export_int8(*arguments)
+
+
 @pytest.mark.parametrize(
     ("options", "canvas"), [({}, (64, 96)), ({"size": "64x128"}, (64, 128)), ({"size": "dynamic"}, None)]
 )
@@ -356,7 +399,7 @@ def test_doubled_masks_of_shipped_weights(tmp_path: Path, format_: Any, name: st
 def test_nothing_is_written_beyond_the_tolerance(
     traced: str, tmp_path: Path, frames: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(TOLERANCES, "fp32", Tolerance(pixels=1.1, boxes=1.1, confidence=1.0))
+    monkeypatch.setitem(TOLERANCES, "fp32", Tolerance(pixels=1.1, overlap=1.1, boxes=1.1, confidence=1.0))
     with pytest.raises(BackendError, match=r"not written after comparison with the network: .*pixels agree"):
         export(traced, size="64x128", output=tmp_path / "a.onnx", frames=frames)
     assert not list(tmp_path.glob("*a.*"))
@@ -428,7 +471,7 @@ def test_int8(traced: str, tmp_path: Path, frames: Path, format_: str, monkeypat
         pytest.importorskip("nncf")
     else:
         monkeypatch.setattr(command, "build_onnx", build_onnx)  # in the layout of this runtime
-    monkeypatch.setitem(TOLERANCES, "int8", Tolerance(pixels=0.5, boxes=0.0, confidence=1.0))
+    monkeypatch.setitem(TOLERANCES, "int8", Tolerance(pixels=0.5, overlap=0.0, boxes=0.0, confidence=1.0))
     bar = Bar()
     monkeypatch.setattr(command, "show_progress", lambda _: contextlib.nullcontext(bar))
     path = tmp_path / ("a.xml" if format_ == "openvino" else "a.onnx")
@@ -523,8 +566,8 @@ def test_int8_keeps_as_little_in_floating_point_as_the_scores_allow(
 def test_suppression_inside_is_not_overridden_silently(traced: str, tmp_path: Path) -> None:
     path = export(traced, output=tmp_path / "a.onnx", size="64x128", nms=True).path
     inside = trilitenet.load(path).thresholds
-    assert trilitenet.load(path, confidence=0.9, iou=0.1).thresholds.confidence == 0.9
-    for change in ({"confidence": inside.confidence / 2}, {"iou": 0.99}):
+    assert trilitenet.load(path, confidence=0.9, iou=inside.iou).thresholds.confidence == 0.9
+    for change in ({"confidence": inside.confidence / 2}, {"iou": 0.99}, {"iou": 0.1}):
         with pytest.raises(ConfigError, match="export it without --nms"):
             trilitenet.load(path, **change)  # type: ignore[arg-type]
 

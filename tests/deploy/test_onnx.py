@@ -22,6 +22,7 @@ from trilitenet.deploy.quantize import KEEP_STEPS, kept_nodes
 from trilitenet.deploy.quiet import quiet
 from trilitenet.deploy.tensorrt import trtexec_line
 from trilitenet.errors import BackendError, ConfigError
+from trilitenet.inference.openvino_backend import openvino_core
 from trilitenet.processing.boxes import cxcywh_to_xyxy
 from trilitenet.processing.nms import nms
 
@@ -71,10 +72,11 @@ def test_suppression_inside_keeps_what_suppression_outside_keeps(tmp_path: Path)
         assert np.abs(np.sort(one.boxes.confidence) - np.sort(other.boxes.confidence)).max() < 1e-4
 
 
-def test_portable_graphs_keep_to_their_operators() -> None:
-    network = lively_network()
-    info = ArtefactInfo("onnx", size=SIZE, input="float_nchw", masks="logit")
-    model = build_onnx(DeployGraph(network, LAYOUTS["planar"], masks="logit"), network.card, info)
+@pytest.mark.parametrize(("classes", "size", "bgr"), [(1, SIZE, False), (3, (96, 64), True)])
+def test_portable_graphs_keep_to_their_operators(classes: int, size: tuple[int, int], bgr: bool) -> None:
+    network = lively_network(classes=classes)
+    info = ArtefactInfo("onnx", size=size, input="float_nchw", masks="logit")
+    model = build_onnx(DeployGraph(network, LAYOUTS["planar"], masks="logit", bgr=bgr), network.card, info)
     assert {node.op_type for node in model.graph.node} <= PORTABLE_OPERATORS
     inferred = onnx.shape_inference.infer_shapes(model)
     ranks = [len(value.type.tensor_type.shape.dim) for value in inferred.graph.value_info]
@@ -227,3 +229,21 @@ def test_suppression_inside_is_exact_for_any_number_of_classes(classes: int, mos
     boxes = cxcywh_to_xyxy(rows[0, likely, :4])
     outside = likely[nms(boxes, confidence[likely], class_id[likely], 0.4, most)]
     np.testing.assert_array_equal(inside[0], rows[0, outside])
+
+
+@pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
+def test_suppression_inside_at_an_iou_of_0_leaves_boxes_that_do_not_touch(runtime: str) -> None:
+    rows = np.array([[[10, 10, 8, 8, 0.9, 1], [11, 10, 8, 8, 0.8, 1], [40, 10, 8, 8, 0.7, 1]]], np.float32)
+    helper = onnx.helper
+    value = {name: helper.make_tensor_value_info(name, 1, list(rows.shape)) for name in ("rows", "detection")}
+    node = helper.make_node("Identity", ["rows"], ["detection"])
+    graph = helper.make_graph([node], "g", [value["rows"]], [value["detection"]])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    deploy_onnx._append_nms(onnx, model, 1, Thresholds(confidence=0.4, iou=0.0))
+    if runtime == "onnxruntime":
+        session = pytest.importorskip("onnxruntime").InferenceSession(model.SerializeToString())
+        (kept,) = session.run(None, {"rows": rows})
+    else:
+        core = openvino_core(pytest.importorskip("openvino"))
+        kept = core.compile_model(core.read_model(model.SerializeToString(), b""), "CPU")([rows])[0]
+    np.testing.assert_allclose(kept[0], rows[0, [0, 2]], rtol=1e-2)

@@ -1,12 +1,15 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from trilitenet.deploy.parity import Parity, Tolerance, compare
+from trilitenet.deploy.parity import TOLERANCES, Parity, Tolerance, compare
 from trilitenet.structures import RawOutputs
 
-STRICT = Tolerance(pixels=0.999, boxes=0.99, confidence=0.02)
+STRICT = Tolerance(pixels=0.999, overlap=0.98, boxes=0.99, confidence=0.02)
 CANVAS = np.zeros((32, 64, 3), np.uint8)
 
 
@@ -98,7 +101,7 @@ def test_a_box_at_the_very_threshold_is_looked_for_on_both_sides_of_it() -> None
     above, below = (
         RawOutputs(np.array([[[20, 15, 16, 10, score, 1.0]]], np.float32), None, None) for score in (0.31, 0.24)
     )
-    loose = Tolerance(pixels=0.999, boxes=0.99, confidence=0.1)
+    loose = Tolerance(pixels=0.999, overlap=0.98, boxes=0.99, confidence=0.1)
     found = compare(lambda _: above, lambda _: below, [CANVAS], loose, confidence=0.25)
     assert found.boxes == 1.0
 
@@ -173,6 +176,50 @@ def test_boxes_that_are_no_numbers_fail() -> None:
 
 
 def test_what_is_just_within_the_tolerance_passes() -> None:
-    just = Parity(1, 0.999, 0.99, 0.0, STRICT, detection=True)
+    just = Parity(1, 0.999, 0.98, 0.99, 0.0, STRICT, detection=True)
     assert just.failures == []
-    assert len(Parity(1, 0.9989, 0.9899, 0.0, STRICT, detection=True).failures) == 2
+    assert len(Parity(1, 0.9989, 0.9799, 0.9899, 0.0, STRICT, detection=True).failures) == 3
+
+
+def of_lane(lane: NDArray[np.bool_]) -> RawOutputs:
+    return RawOutputs(None, None, (255 * lane[None]).astype(np.uint8))
+
+
+@pytest.mark.parametrize("precision", TOLERANCES)
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(np.zeros_like, id="empty"),
+        pytest.param(lambda lane: lane[:, ::-1], id="mirrored"),
+        pytest.param(lambda lane: np.roll(lane, 8, 1), id="shifted"),
+    ],
+)
+def test_a_wrong_lane_mask_is_refused_at_every_precision(
+    precision: str, change: Callable[[NDArray[np.bool_]], NDArray[np.bool_]]
+) -> None:
+    lane = np.zeros((384, 640), bool)
+    lane[100:, 200:208] = True  # of 1% of the pixels: the others agree
+    right, wrong = of_lane(lane), of_lane(change(lane))
+    parity = compare(lambda _: right, lambda _: wrong, [CANVAS], TOLERANCES[precision])
+    assert any("masks overlap with an IoU of 0.0000" in failure for failure in parity.failures)
+    parity = compare(lambda _: right, lambda _: right, [CANVAS], TOLERANCES[precision])
+    assert (parity.overlap, parity.failures) == (1.0, [])
+    assert parity.summary() == "parity: 1 frames, mask pixels equal 1.000000, IoU of masks 1.0000"
+
+
+def test_masks_overlap_over_all_frames_together() -> None:
+    lane = np.zeros((32, 64), bool)
+    lane[:, :10] = True
+    few = np.arange(64) < 2
+    expected, got = (iter(map(of_lane, masks)) for masks in ((lane, few[None]), (np.roll(lane, 1, 1), ~few[None])))
+    parity = compare(lambda _: next(expected), lambda _: next(got), [CANVAS] * 2, STRICT)
+    assert parity.overlap == (32 * 9) / (32 * 11 + 64)
+
+
+def test_masks_of_next_to_no_foreground_are_not_compared_by_overlap() -> None:
+    lane = np.zeros((384, 640), bool)
+    empty = of_lane(np.zeros_like(lane))
+    for size, overlap in ((299, None), (300, 0.0)):
+        lane[0, :size] = True
+        found = compare(lambda _: of_lane(lane), lambda _: empty, [CANVAS], STRICT)
+        assert found.overlap == overlap

@@ -69,12 +69,27 @@ def test_a_model_is_replaced_whole(tmp_path: Path) -> None:
     repository = tmp_path / "repository"
     name = "m" * 255  # as long as file systems take names
     model = write_triton_repository(artefact, repository, ModelCard("tiny"), name=name)
-    (model / "2").mkdir()
+    (model / "1" / "model.onnx").write_text("old")
     with pytest.raises(OutputError, match="exists already"):
         write_triton_repository(artefact, repository, ModelCard("tiny"), name=name)
     assert write_triton_repository(artefact, repository, ModelCard("base"), name=name, overwrite=True) == model
     assert [path.name for path in sorted(model.rglob("*"))] == ["1", "model.onnx", "config.pbtxt"]
+    assert (model / "1" / "model.onnx").read_bytes() == artefact.read_bytes()
+    assert "base" in (model / "config.pbtxt").read_text(encoding="utf-8")
     assert [path.name for path in repository.iterdir()] == [name]
+
+
+def test_what_a_user_keeps_beside_a_model_stays(tmp_path: Path) -> None:
+    artefact = _artefact(tmp_path / "x.onnx")
+    model = write_triton_repository(artefact, tmp_path / "repository", ModelCard("tiny"))
+    own = {name: model / name for name in ("labels.txt", "1/warm-up", "2/model.onnx", "2/1/config.pbtxt")}
+    for name, path in own.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(name)
+    (model / "3").symlink_to("2", target_is_directory=True)
+    write_triton_repository(artefact, tmp_path / "repository", ModelCard("tiny"), overwrite=True)
+    assert {name: path.read_text() for name, path in own.items()} == {name: name for name in own}
+    assert (model / "3").readlink() == Path("2")
 
 
 def test_types_are_named_as_triton_names_them(tmp_path: Path) -> None:

@@ -362,6 +362,20 @@ def test_openvino_without_its_weights_file(artefacts: Artefacts, tmp_path: Path)
         OpenVINOBackend(tmp_path / "model.xml")
 
 
+def test_openvino_with_the_weights_of_another_export(artefacts: Artefacts, tmp_path: Path) -> None:
+    shutil.copy(artefacts.folder / "model.xml", tmp_path / "model.xml")
+    weights = bytearray((artefacts.folder / "model.bin").read_bytes())
+    weights[len(weights) // 2] ^= 1
+    (tmp_path / "model.bin").write_bytes(weights)
+    with pytest.raises(WeightsError, match=r"model\.bin: not the weights that model\.xml was written for"):
+        OpenVINOBackend(tmp_path / "model.xml")
+    graph = (tmp_path / "model.xml").read_text(encoding="utf-8")
+    older = re.sub(r"<weights_sha256 [^>]*/>", "", graph)
+    assert older != graph
+    (tmp_path / "model.xml").write_text(older, encoding="utf-8")
+    OpenVINOBackend(tmp_path / "model.xml").close()
+
+
 @pytest.mark.parametrize("kind", [OnnxBackend, OpenVINOBackend])
 def test_a_graph_that_was_cut_off_is_told_in_our_words(
     artefacts: Artefacts, tmp_path: Path, capfd: pytest.CaptureFixture[str], kind: Any

@@ -133,10 +133,16 @@ def test_thresholds_that_a_file_fixes_inside_are_refused() -> None:
     own = backend.card.thresholds
     backend.info = ArtefactInfo("onnx", masks="probability", nms=True)  # type: ignore[attr-defined]
     assert Predictor(backend).least_confidence == own.confidence
-    Predictor(backend, dataclasses.replace(own, confidence=0.99, iou=own.iou / 2, drivable=0.9))
-    for wrong in (dataclasses.replace(own, confidence=own.confidence / 2), dataclasses.replace(own, iou=0.99)):
-        with pytest.raises(ConfigError, match="export it without --nms"):
-            Predictor(backend, wrong)
+    Predictor(backend, dataclasses.replace(own, confidence=0.99, max_boxes=own.max_boxes - 1, drivable=0.9))
+    changes: tuple[dict[str, Any], ...] = (
+        {"confidence": own.confidence / 2},
+        {"iou": 0.99},
+        {"iou": own.iou / 2},  # a box that is gone inside may be one that this would have kept
+        {"max_boxes": own.max_boxes + 1},
+    )
+    for change in changes:
+        with pytest.raises(ConfigError, match="another IoU or more boxes export it without --nms"):
+            Predictor(backend, dataclasses.replace(own, **change))
     backend.info = ArtefactInfo("onnx")  # type: ignore[attr-defined]
     assert Predictor(backend, dataclasses.replace(own, confidence=0.01)).least_confidence == 0
     for decided in (dataclasses.replace(own, lane=0.9), dataclasses.replace(own, drivable=0.9)):

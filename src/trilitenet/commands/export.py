@@ -119,7 +119,8 @@ class Exported:
 
     def summary(self) -> str:
         """Return the lines that the command line prints."""
-        size = "any multiple of 32" if self.info.size is None else f"{self.info.size[1]}x{self.info.size[0]}"
+        anything = "any multiple of 32" + (" from 64 to 4096" if self.info.format == "torch" else "")
+        size = anything if self.info.size is None else f"{self.info.size[1]}x{self.info.size[0]}"
         lines = [f"{self.path}: {self.info.format} {self.info.precision}, input {size} {self.info.colour.upper()}"]
         if self.parity is not None:
             lines.append(self.parity.summary())
@@ -162,20 +163,22 @@ def export(
         output: File to write (for triton, the folder of the repository); by default named after the model, here.
         precision: fp32, fp16 (weights stored so; on Arm, NCNN computes so too), bf16 (OpenVINO) or int8 (needs
             --calibration).
-        size: HEIGHTxWIDTH of the input in multiples of 32, or dynamic (not with ncnn, executorch or tensorrt); the size
-            that the model was trained at if left out.
+        size: HEIGHTxWIDTH of the input in multiples of 32, or dynamic (not with int8, --portable, ncnn, executorch or
+            tensorrt); the size that the model was trained at if left out.
         calibration: Frames for INT8: a data set in the published layout (its train split) or a folder of pictures.
         calibration_frames: At most so many of them.
         max_drop: INT8 may lose at most so many points of a score on the val split of --calibration; layers fall back
             to floating point, part by part, until it does.
         nms: Put non-maximum suppression inside, with the model's thresholds (onnx, openvino, triton).
-        portable: Avoid operators that compilers for phones and accelerators refuse; float input, float mask logits.
+        portable: Avoid operators that compilers for phones and accelerators refuse; float input, float mask logits; of
+            a fixed size and, as onnx and triton, fp32.
         masks: decision (0 or 1, by the model's thresholds; the default), probability (x 255) or logit (the only choice,
             and the default, with --portable, ncnn, executorch and tensorrt).
         mask_scale: 2 doubles the size of masks inside the graph.
         bgr: Take BGR pixels (`trilitenet.load` converts by itself).
         layout: auto, or a memory layout by name (docs/speed.md); all compute the same.
-        frames: Pictures for the comparison; by default those of --calibration, else synthetic scenes.
+        frames: Pictures for the comparison; by default those of --calibration, else synthetic scenes. INT8 that was
+            calibrated on a folder of pictures is compared on both.
         network: The function that built the network, where it is one of your own with other widths or numbers of
             blocks: FILE.py:FUNCTION or MODULE:FUNCTION. Other layers cannot be exported.
         overwrite: Replace existing files of an artefact.
@@ -248,7 +251,10 @@ def export(
         mask_scale=mask_scale,
         bgr=bgr,
     )
-    checks = _canvases(frames or calibration, parsed or trained.card.input_size, 8)
+    canvas = parsed or trained.card.input_size
+    checks = _canvases(frames or calibration, canvas, 8)
+    if precision == "int8" and frames is None and calibration is not None and not _has_val(calibration):
+        checks += _canvases(None, canvas, 4)  # the others are what it was calibrated on
     if format == "torch":
         traceable = Traceable(graph, trained.card, info)
         with torch.no_grad():
@@ -305,8 +311,11 @@ def _check_options(
         raise ConfigError("--max-drop measures the boxes that --nms drops; find what to keep without --nms")
     if portable and layout not in ("auto", "planar"):
         raise ConfigError(f"--portable is planar, as are {', '.join(_PORTABLE)}; leave --layout {layout} out")
-    if size is None and (precision == "int8" or format in _PORTABLE):
-        raise ConfigError(f"{'int8' if precision == 'int8' else format} needs a fixed --size")
+    if size is None and (precision == "int8" or portable):
+        what = "int8" if precision == "int8" else format if format in _PORTABLE else "--portable"
+        raise ConfigError(f"{what} needs a fixed --size")
+    if portable and format in ("onnx", "triton") and precision != "fp32":
+        raise ConfigError(f"--portable keeps to operators that {precision} needs more than; choose one of them")
     if portable and masks not in (None, "logit"):
         raise ConfigError(
             f"masks of --portable, {', '.join(_PORTABLE)} are logits; give --masks logit or leave it out, not {masks}"
@@ -333,7 +342,7 @@ def _destination(model: str, format: Format, output: Path | None) -> Path:
         return (output or Path("model_repository")) / Path(model).stem
     ending = ARTEFACT_SUFFIXES[format]
     path = output or Path(f"{Path(model).stem}{ending}")
-    endings = (ending, ".onnx") if format == "tensorrt" else (ending,)
+    endings = (ending, ".onnx") if format == "tensorrt" and not is_installed() else (ending,)
     if not path.name.endswith(endings):
         raise ConfigError(f"{format} artefacts end with {ending}, not {path.suffix or 'nothing'}")
     return path
@@ -399,13 +408,17 @@ def find_pictures(source: Path, count: int, split: str) -> list[Path]:
     images = source / "images"
     folder = images / split
     if not folder.is_dir():
-        if split == "train" and (images / "val").is_dir():
+        if split == "train" and _has_val(source):
             raise InputError(f"{source}: has no train split to calibrate on; give a folder of other pictures")
         folder = images if images.is_dir() else source  # a data set's masks are no pictures
     paths = sorted(path for path in folder.rglob("*") if is_image_file(path.name))
     if not paths:
         raise InputError(f"{source}: no pictures there")
     return _spread(paths, count)
+
+
+def _has_val(data: Path) -> bool:
+    return (data / "images" / "val").is_dir()
 
 
 def drop_frames(data: Path, class_names: Sequence[str] | None = None) -> DrivingDataset:
@@ -548,7 +561,7 @@ class _Drop:
     """The largest loss of a score in points on the val split, against the float32 network on the same pixels."""
 
     def __init__(self, network: TriLiteNet, size: tuple[int, int] | None, data: Path, bar: ProgressBar) -> None:
-        if not (data / "images" / "val").is_dir():
+        if not _has_val(data):
             raise ConfigError(f"--max-drop needs labels; {data} is not a data set with a val split")
         self._bar = bar
         tasks = network.card.tasks
@@ -585,9 +598,12 @@ def _export_int8(
     canvas = info.size or network.card.input_size
     reason = ""
     with show_progress("frames read") as bar:
-        pictures = _Counted(find_pictures(calibration, calibration_frames, "train"), bar)
-        inputs = [prepare_input(_on_canvas(read_image(picture), canvas), info) for picture in pictures]
-        budget = None if max_drop is None else _Drop(network, info.size, calibration, bar)
+        pictures = find_pictures(calibration, calibration_frames, "train")
+        budget = None
+        if max_drop is not None:
+            budget = _Drop(network, info.size, calibration, bar)
+            bar.name("frames read")
+        inputs = [prepare_input(_on_canvas(read_image(one), canvas), info) for one in _Counted(pictures, bar)]
         for keep in KEEP_STEPS if budget else KEEP_STEPS[1:2]:
             bar.name("frames calibrated with")
             candidate = quantize(_Counted(inputs, bar), keep)

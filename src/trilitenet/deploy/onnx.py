@@ -117,7 +117,8 @@ def _append_nms(onnx: Any, model: Any, classes: int, thresholds: Thresholds) -> 
     """Append suppression: detection becomes (1, kept, 5 + classes), best first.
 
     As after the graph, a box has one class, its most probable, and meets only boxes of that class: its confidence
-    stands in the row of that class alone. Of all classes together the best ``max_boxes`` are kept.
+    stands in the row of that class alone. Of all classes together the best ``max_boxes`` are kept. The IoU is never 0:
+    OpenVINO suppresses from the threshold on, ONNX Runtime and this package above it.
     """
     helper, numpy_helper, graph = onnx.helper, onnx.numpy_helper, model.graph
     for node in graph.node:
@@ -155,7 +156,7 @@ def _append_nms(onnx: Any, model: Any, classes: int, thresholds: Thresholds) -> 
     add("Transpose", [rows], ["nms_scores"], perm=[0, 2, 1])
     limits = [
         const("max", np.array([thresholds.max_boxes], np.int64)),
-        const("iou", np.array([thresholds.iou], np.float32)),
+        const("iou", np.array([max(thresholds.iou, 1e-6)], np.float32)),
         const("score", np.array([thresholds.confidence], np.float32)),
     ]
     add("NonMaxSuppression", [boxes, "nms_scores", *limits], ["nms_selected"], center_point_box=1)

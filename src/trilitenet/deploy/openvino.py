@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from pathlib import Path
 from typing import Any
 
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, WEIGHTS_HASH_KEY, ArtefactInfo, ModelCard
 from trilitenet.deploy.layouts import Unit
 from trilitenet.errors import OutputError, gist, import_extra
 from trilitenet.processing.cores import processor
@@ -47,7 +48,7 @@ def with_own_biases(model: Any) -> Any:
 
 
 def save_openvino(model: Any, path: str | os.PathLike[str], card: ModelCard, info: ArtefactInfo) -> None:
-    """Write ``.xml`` and ``.bin``.
+    """Write ``.xml``, with the SHA-256 of the weights, and ``.bin``.
 
     Args:
         model: The ``openvino.Model``.
@@ -58,11 +59,15 @@ def save_openvino(model: Any, path: str | os.PathLike[str], card: ModelCard, inf
     Raises:
         OutputError: If they cannot be written.
     """
-    openvino = import_extra("openvino", "openvino")
+    openvino, path = import_extra("openvino", "openvino"), Path(path)
     model.set_rt_info(card.to_json(), CARD_KEY.split("."))
     model.set_rt_info(info.to_json(), ARTEFACT_KEY.split("."))
+    half = info.precision == "fp16"
     try:
-        openvino.save_model(model, Path(path), compress_to_fp16=info.precision == "fp16")
+        openvino.save_model(model, path, compress_to_fp16=half)
+        weights = hashlib.sha256(path.with_suffix(".bin").read_bytes()).hexdigest()
+        model.set_rt_info(weights, WEIGHTS_HASH_KEY.split("."))
+        openvino.save_model(model, path, compress_to_fp16=half)  # the weights are the same each time
     except RuntimeError as error:  # "basic_ios::clear: iostream error" where the disk is full
         raise OutputError(f"{path}: cannot be written ({gist(error)}); is there room?") from error
 

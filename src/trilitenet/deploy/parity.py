@@ -22,21 +22,24 @@ class Tolerance:
 
     Attributes:
         pixels: Least share of mask pixels that agree.
+        overlap: Least intersection over union of a task's masks, over all frames together; lanes are so few pixels
+            that most agree where there is none.
         boxes: Least share of the network's confident boxes that the artefact has too (IoU of at least 0.9, or
             sides less than half a pixel apart), and the reverse.
         confidence: Most that the confidence of such a pair may differ.
     """
 
     pixels: float
+    overlap: float
     boxes: float
     confidence: float
 
 
 TOLERANCES: Final[dict[str, Tolerance]] = {
-    "fp32": Tolerance(pixels=0.9999, boxes=0.995, confidence=0.02),
-    "fp16": Tolerance(pixels=0.998, boxes=0.95, confidence=0.1),
-    "bf16": Tolerance(pixels=0.99, boxes=0.85, confidence=0.3),
-    "int8": Tolerance(pixels=0.90, boxes=0.50, confidence=0.5),
+    "fp32": Tolerance(pixels=0.9999, overlap=0.99, boxes=0.995, confidence=0.02),
+    "fp16": Tolerance(pixels=0.998, overlap=0.90, boxes=0.95, confidence=0.1),
+    "bf16": Tolerance(pixels=0.99, overlap=0.85, boxes=0.85, confidence=0.3),
+    "int8": Tolerance(pixels=0.90, overlap=0.50, boxes=0.50, confidence=0.5),
 }
 """A precision. INT8 is judged by its scores (``--max-drop``); here it is only kept from being nonsense."""
 
@@ -48,6 +51,8 @@ class Parity:
     Attributes:
         frames: Frames compared.
         pixels: Share of mask pixels that agree, the worse of the two tasks; None without masks.
+        overlap: Intersection over union of the masks, the worse of the two tasks; None without masks, or without
+            foreground worth comparing.
         boxes: Share of confident boxes found in both; None without detection, or without any box.
         box_error: Mean distance of the sides of such pairs in pixels; None likewise.
         tolerance: What was asked for.
@@ -56,6 +61,7 @@ class Parity:
 
     frames: int
     pixels: float | None
+    overlap: float | None
     boxes: float | None
     box_error: float | None
     tolerance: Tolerance
@@ -67,6 +73,10 @@ class Parity:
         found = []
         if self.pixels is not None and self.pixels < self.tolerance.pixels:
             found.append(f"{self.pixels:.5f} of mask pixels agree, at least {self.tolerance.pixels} must")
+        if self.overlap is not None and self.overlap < self.tolerance.overlap:
+            found.append(
+                f"masks overlap with an IoU of {self.overlap:.4f}, it must be at least {self.tolerance.overlap}"
+            )
         if self.boxes is not None and self.boxes < self.tolerance.boxes:
             found.append(f"{self.boxes:.4f} of boxes agree, at least {self.tolerance.boxes} must")
         if self.pixels is None and self.boxes is None:
@@ -78,6 +88,8 @@ class Parity:
         parts = [f"{self.frames} frames"]
         if self.pixels is not None:
             parts.append(f"mask pixels equal {self.pixels:.6f}")
+        if self.overlap is not None:
+            parts.append(f"IoU of masks {self.overlap:.4f}")
         if self.boxes is not None:
             parts.append(f"boxes in both {self.boxes:.4f} (sides {self.box_error:.2f} px apart)")
         elif self.detection:
@@ -87,6 +99,8 @@ class Parity:
 
 LIMIT: Final = 300
 """At most so many boxes of a frame are looked for, the most confident."""
+FOREGROUND: Final = 300
+"""Masks of fewer foreground pixels in all frames together are too small for their overlap to say anything."""
 
 
 def compare(
@@ -110,6 +124,7 @@ def compare(
             confidence that there is.
     """
     equal: dict[str, list[float]] = {"drivable": [], "lane": []}
+    areas = {name: np.zeros(2, np.int64) for name in equal}  # intersection, union
     rows: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
     for canvas in canvases:
         expected, got = reference(canvas[None]), artefact(canvas[None])
@@ -117,7 +132,9 @@ def compare(
             wanted, mask = getattr(expected, name), getattr(got, name)
             if wanted is not None:
                 limit = mask_limit(threshold)
-                equal[name].append(float(np.mean((wanted[0] > limit) == (mask[0] > limit))))
+                one, other = wanted[0] > limit, mask[0] > limit
+                equal[name].append(float(np.mean(one == other)))
+                areas[name] += np.count_nonzero(one & other), np.count_nonzero(one | other)
         if expected.detection is not None and got.detection is not None:
             rows += [(expected.detection[0], got.detection[0]), (got.detection[0], expected.detection[0])]
     levels = _levels([one for one, _ in rows], confidence)
@@ -125,9 +142,11 @@ def compare(
     matched, total = sum(count for count, _, _ in pairs), sum(count for _, count, _ in pairs)
     errors = [error for _, _, found in pairs for error in found]
     shares = [float(np.mean(values)) for values in equal.values() if values]
+    overlaps = [float(intersection / union) for intersection, union in areas.values() if union >= FOREGROUND]
     return Parity(
         frames=len(canvases),
         pixels=min(shares) if shares else None,
+        overlap=min(overlaps) if overlaps else None,
         boxes=matched / total if total else None,
         box_error=float(np.mean(errors)) if errors else (0.0 if total else None),
         tolerance=tolerance,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -46,7 +47,7 @@ def write_triton_repository(
         folder: The repository; other models in it are left alone.
         card: The artefact's model card.
         name: Of the model; that of the variant if left out.
-        overwrite: Replace the model if it is there already.
+        overwrite: Replace the model if it is there already; what else is in its folder, such as other versions, stays.
 
     Returns:
         The model's folder.
@@ -63,12 +64,25 @@ def write_triton_repository(
     with writing(model), folder_beside(model) as place:
         made, former = place / "made", place / "former"
         (made / "1").mkdir(parents=True)
+        _copy(model, made, without=("config.pbtxt", "1"))
+        _copy(model / "1", made / "1", without=("model.onnx",))
         shutil.copyfile(artefact, made / "1" / "model.onnx")
         (made / "config.pbtxt").write_text(_config(model.name, inputs, outputs, card), encoding="utf-8")
         if model.exists():
             model.replace(former)
         made.replace(model)
     return model
+
+
+def _copy(folder: Path, target: Path, without: Collection[str]) -> None:
+    """Copy what is in a folder, if there is one, but the names in ``without``; links stay links."""
+    for entry in folder.iterdir() if folder.is_dir() else ():
+        if entry.name in without:
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.copytree(entry, target / entry.name, symlinks=True)
+        else:
+            shutil.copy2(entry, target / entry.name, follow_symlinks=False)
 
 
 def read_tensors(artefact: Path) -> tuple[list[TensorSpec], list[TensorSpec]]:

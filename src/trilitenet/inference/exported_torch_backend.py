@@ -6,7 +6,7 @@ import logging
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -20,9 +20,12 @@ from trilitenet.inference.torch_backend import check_threads, pick_device
 
 __all__ = ["ExportedTorchBackend"]
 
+_SIDES: Final = (64, 4096)
+"""Pixels of the least and the greatest side that a program of any size was traced for."""
+
 
 class ExportedTorchBackend(ArtefactBackend):
-    """An artefact of ``trilitenet export --format torch``; one of any size takes sides from 64 pixels on.
+    """An artefact of ``trilitenet export --format torch``; one of any size takes sides of 64 to 4096.
 
     Args:
         path: The ``.pt2`` file.
@@ -74,10 +77,10 @@ class ExportedTorchBackend(ArtefactBackend):
         module = held(self._module, self._path)
         check_threads()
         height, width = batch.shape[1:3]
-        if self.info.size is None and min(height, width) < 64:
+        if self.info.size is None and not (_SIDES[0] <= min(height, width) and max(height, width) <= _SIDES[1]):
             raise ShapeError(
-                f"a dynamic .pt2 takes sides from 64 pixels, got {width}x{height}: use the weights, or export it "
-                "with a fixed --size"
+                f"a dynamic .pt2 takes sides from {_SIDES[0]} pixels to {_SIDES[1]}, got {width}x{height}: use the "
+                "weights, or export it with a fixed --size"
             )
         with torch.no_grad():
             return [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import functools
+import hashlib
 import os
 import queue
 import threading
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, WEIGHTS_HASH_KEY
 from trilitenet.errors import BackendError, ConfigError, WeightsError, gist, import_extra
 from trilitenet.inference.backend import MOST_PARALLEL, check_process, held, replaced
 from trilitenet.inference.exported import ArtefactBackend, check_graph, prepare_input, read_metadata
@@ -82,7 +83,11 @@ class OpenVINOBackend(ArtefactBackend):
             elif "is_valid_weights_range" in said or "Incorrect weights" in said:
                 reason = f"{weights.name} is cut off, or of another file; export it again"
             raise WeightsError(f"{path}: not a usable OpenVINO or ONNX model ({reason})") from error
-        self._card, self.info = read_metadata(_metadata(model), str(path))
+        metadata = _metadata(model)
+        self._card, self.info = read_metadata(metadata, str(path))
+        wanted_weights = metadata.get(WEIGHTS_HASH_KEY)
+        if wanted_weights is not None and hashlib.sha256(weights.read_bytes()).hexdigest() != wanted_weights:
+            raise WeightsError(f"{weights}: not the weights that {path.name} was written for; export the model again")
         shapes = [
             [] if each.rank.is_dynamic else [None if side.is_dynamic else side.get_length() for side in each]
             for each in (entry.partial_shape for entry in model.inputs)
@@ -215,7 +220,7 @@ def _requests(compiled: Any, count: int) -> queue.SimpleQueue[Any]:
 def _metadata(model: Any) -> dict[str, str]:
     """Return an OpenVINO model's own key-value pairs, wherever the format keeps them."""
     found = {}
-    for key in (CARD_KEY, ARTEFACT_KEY):
+    for key in (CARD_KEY, ARTEFACT_KEY, WEIGHTS_HASH_KEY):
         for path in (key.split("."), ["framework", key], ["framework", *key.split(".")]):
             if model.has_rt_info(path):
                 found[key] = str(model.get_rt_info(path).astype(str))

@@ -89,10 +89,13 @@ class Predictor:
                 "this artefact decides masks inside, by the thresholds of the model it was exported from; "
                 "for others export it with --masks probability"
             )
-        if info.nms and (wanted.confidence < self.least_confidence or wanted.iou > inside.iou):
+        # Nor a lower IoU: boxes are gone that a box suppressed at it would have suppressed.
+        if info.nms and (
+            wanted.confidence < self.least_confidence or wanted.iou != inside.iou or wanted.max_boxes > inside.max_boxes
+        ):
             raise ConfigError(
-                f"this artefact suppresses boxes inside, at confidence {inside.confidence:g} and IoU {inside.iou:g}; "
-                "for a lower confidence or a higher IoU export it without --nms"
+                f"this artefact keeps {inside.max_boxes} boxes inside, at confidence {inside.confidence:g} and IoU "
+                f"{inside.iou:g}; for a lower confidence, another IoU or more boxes export it without --nms"
             )
 
     @property
