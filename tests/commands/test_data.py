@@ -179,17 +179,17 @@ def test_a_conversion_without_images_or_labels_is_an_error(
 @pytest.mark.parametrize("kind", ["bdd100k", "masks"])
 def test_what_missing_labels_mean_is_refused_where_files_tell_it(raw: Path, tmp_path: Path, kind: Any) -> None:
     (tmp_path / "classes.yaml").write_text("missing: empty\n")
-    with pytest.raises(ConfigError, match=f"'missing' .* is for coco, yolo and cvat; leave it out for {kind}"):
+    with pytest.raises(ConfigError, match=f"'missing' .* is for coco, yolo, cvat; leave it out for {kind}"):
         convert(str(raw), tmp_path / "out", kind=kind, classes=tmp_path / "classes.yaml")
 
 
 @pytest.mark.parametrize(
     ("line", "kinds"),
     [
-        ("tasks: [detection]", "coco, yolo, cvat and masks"),
-        ("drivable: [road]", "coco, yolo and cvat"),
+        ("tasks: [detection]", "coco, yolo, cvat, masks"),
+        ("drivable: [road]", "coco, yolo, cvat"),
         ("lane_edges: true", "cvat"),
-        ("split: val", "coco, cvat and masks"),
+        ("split: val", "coco, cvat, masks"),
         ("images: frames", "masks"),
     ],
 )
@@ -201,6 +201,17 @@ def test_a_key_that_bdd100k_does_not_take_is_refused(raw: Path, tmp_path: Path, 
         ConfigError, match=f"^'{key}' in the file of --classes is for {kinds}; leave it out for bdd100k$"
     ):
         convert("bdd100k", raw, tmp_path / "out", classes=classes)
+
+
+@pytest.mark.parametrize(
+    ("kind", "line"),
+    [("yolo", "split: val"), ("yolo", "lane_edges: true"), ("coco", "lane_edges: true"), ("masks", "lane: [solid]")],
+)
+def test_a_key_that_another_format_does_not_take_is_refused(tmp_path: Path, kind: Any, line: str) -> None:
+    classes = tmp_path / "classes.yaml"
+    classes.write_text(f"{line}\n")
+    with pytest.raises(ConfigError, match=f"; leave it out for {kind}$"):
+        convert(str(tmp_path), tmp_path / "out", kind=kind, classes=classes)
 
 
 def test_every_key_of_the_file_of_classes_is_taken_or_refused() -> None:

@@ -28,6 +28,7 @@ from trilitenet.commands import predict as command
 from trilitenet.commands.predict import RoadOptions, predict_with
 from trilitenet.errors import BackendError, ConfigError, InputError, MissingExtraError, OutputError, ShapeError
 from trilitenet.formats.writers.native import JsonWriter
+from trilitenet.formats.writers.yolo import YoloWriter
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, VideoReader
 from trilitenet.inference.video import VideoWriter
@@ -549,6 +550,27 @@ def test_a_file_of_all_sources_is_marked_until_it_has_them_all(
     assert (whole.partial, list(output.glob("*.part"))) == ((), [])
 
 
+def test_a_live_source_that_comes_last_leaves_no_rest_behind(
+    tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, output = drive(tmp_path / "drive.mp4", frames=6), tmp_path / "out"
+    write, done = YoloWriter._write, itertools.count(1)
+
+    def interrupted(self: YoloWriter, *arguments: Any) -> None:
+        write(self, *arguments)
+        if next(done) % 2 == 0:
+            signal.default_int_handler(signal.SIGINT, None)
+
+    monkeypatch.setattr(YoloWriter, "_write", interrupted)
+    for live in (False, True):
+        monkeypatch.setattr(VideoReader, "live", live)
+        report = predict_with(predictor, [source], output / str(live), format=("jsonl", "yolo"), overlay=False)
+        assert report.exit_code == 130
+        assert [path.name for path in report.partial] == ([] if live else ["perceptions.jsonl"])
+        marks = {path.name for path in (output / str(live)).glob("*.part")} - {"drive.unfinished.part"}
+        assert marks == (set() if live else {"perceptions.jsonl.unfinished.part"})
+
+
 @pytest.mark.parametrize("format", ["jsonl", "csv", "coco", "yolo", "cvat"])
 def test_results_of_several_sources_in_one_file_cannot_be_skipped(
     format: str, folder: Path, tmp_path: Path, predictor: Predictor
@@ -693,6 +715,8 @@ def test_labels_that_an_earlier_run_left_of_a_video_go_once_it_is_done(
     with monkeypatch.context() as patch:
         patch.setattr(VideoWriter, "write", write_until(2, lambda: signal.default_int_handler(signal.SIGINT, None)))
         assert run(overwrite=True) == [0, 1, 2, 3, 4, 5]
+    for part in (Clip(start=0.1), Clip(end=0.1), Clip(max_frames=1)):  # the rest may be of another run
+        assert run(overwrite=True, clip=part) == [0, 1, 2, 3, 4, 5]
     assert run(overwrite=True, clip=Clip(every=3)) == [0, 3]
 
 

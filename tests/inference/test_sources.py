@@ -513,7 +513,7 @@ def test_a_url_may_be_left_alone_until_it_is_wanted(tmp_path: Path) -> None:
             assert not failures
             assert server.connections == 0
             second.retries = 0
-            second.look()
+            assert second.live is live  # which it finds out
             assert (second.live, second.expected) == (live, None if live else 5)
             frames = list(second)
             assert [index_of(frame) for frame in frames] == [frame.index for frame in frames]

@@ -42,22 +42,20 @@ __all__ = ["Checked", "Converted", "Prepared", "Shown", "check", "convert", "pre
 
 Kind = Literal["bdd100k", "coco", "yolo", "cvat", "masks"]
 
-_KEYS: Final = {
-    "missing": "coco, yolo and cvat",
-    "drivable": "coco, yolo and cvat",
-    "alternative": "coco, yolo and cvat",
-    "lane": "coco, yolo and cvat",
-    "lane_edges": "cvat",
-    "tasks": "coco, yolo, cvat and masks",
-    "split": "coco, cvat and masks",
-    "splits": "masks",
-    "images": "masks",
-    "drivable_mask": "masks",
-    "lane_mask": "masks",
+_KEYS: Final[dict[str, tuple[Kind, ...]]] = {
+    "missing": ("coco", "yolo", "cvat"),
+    "drivable": ("coco", "yolo", "cvat"),
+    "alternative": ("coco", "yolo", "cvat"),
+    "lane": ("coco", "yolo", "cvat"),
+    "lane_edges": ("cvat",),
+    "tasks": ("coco", "yolo", "cvat", "masks"),
+    "split": ("coco", "cvat", "masks"),
+    "splits": ("masks",),
+    "images": ("masks",),
+    "drivable_mask": ("masks",),
+    "lane_mask": ("masks",),
 }
 """Keys of the file of --classes that some formats do not take -> those that do."""
-_REFUSED: Final[dict[str, Collection[str]]] = {"bdd100k": _KEYS.keys(), "masks": ("missing",)}
-"""Without effect, they would be taken for heard."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -453,8 +451,8 @@ def _arguments(source: str, output: StrPath, target: StrPath | None, kind: str |
 def _open_source(kind: str, raw: str, mapping: LabelMapping, options: ConversionOptions) -> RecordSource:
     default = LabelMapping()
     for key, kinds in _KEYS.items():
-        if key in _REFUSED.get(kind, ()) and getattr(mapping, key) != getattr(default, key):
-            raise ConfigError(f"{key!r} in the file of --classes is for {kinds}; leave it out for {kind}")
+        if kind not in kinds and getattr(mapping, key) != getattr(default, key):  # it would be taken for heard
+            raise ConfigError(f"{key!r} in the file of --classes is for {', '.join(kinds)}; leave it out for {kind}")
     if kind == "bdd100k":
         return read_bdd100k(raw, crosswalk=options.crosswalk, vertical=options.vertical)
     readers: dict[str, Callable[[str, LabelMapping], RecordSource]] = {

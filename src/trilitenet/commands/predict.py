@@ -360,8 +360,8 @@ class _Job:
         self.images = self.videos = self.frames = 0
         self.files: list[Path] = []
         self.unfinished: dict[str, bool] = {}
-        self.marked = self.whole = False
-        self.gathered = [self.output / file for file in self._gathered()]
+        self.marked = self.whole = self.endless = False
+        self.gathered = [self.output / file for file, holds in self._shared() if holds]
 
     def _leave_out_long_names(self) -> None:
         """Make a source whose results would have longer names than file systems take a failure of its own."""
@@ -391,7 +391,7 @@ class _Job:
             ConfigError: If a format gathers several sources in one file.
             OutputError: If results that are there say that they are of another source of the same name.
         """
-        for file in self._gathered():
+        for file, _ in self._shared():
             raise ConfigError(
                 f"--skip-existing needs formats with a file for each source, and {file} is one for all; choose another "
                 "--format, or --overwrite"
@@ -434,12 +434,13 @@ class _Job:
         """Return the file that is there while the results of a video are not of all its frames."""
         return part_of(self.output / f"{self.stems[name]}.unfinished")
 
-    def _gathered(self) -> Iterator[str]:
-        """Yield the names of the files that hold several sources."""
+    def _shared(self) -> Iterator[tuple[str, bool]]:
+        """Yield the names of the files that are one for all sources, and whether they hold what is of each."""
         for name in self.formats:
             writer = find_writer(name)
             patterns = {pattern for source in self.sources for pattern in _patterns(writer, source)}
-            yield from (pattern for pattern in (*writer.FILES, *sorted(patterns)) if "{}" not in pattern)
+            files = [pattern for pattern in (*writer.FILES, *sorted(patterns)) if "{}" not in pattern]
+            yield from ((file, writer.GATHERS) for file in files)
 
     def _mark_gathered(self) -> None:
         """Leave the marks of the files of all sources, which hold but some of them until the run's end."""
@@ -536,6 +537,7 @@ class _Job:
                 stack.enter_context(contextlib.closing(self.window))
             many = len(self.sources) > _MOST_BARS
             all_of_them = progress.add_task("all sources", total=len(self.sources)) if many else None
+            source: Stills | FrameReader | None = None
             try:
                 for source in self.sources:
                     self._run_source(source, predictor, progress)
@@ -544,10 +546,10 @@ class _Job:
                             progress.remove_task(task)
                         progress.advance(all_of_them)
                 self.whole = True
-            except _WindowClosed:
-                pass
-            except KeyboardInterrupt:
-                interrupted = True
+            except (_WindowClosed, KeyboardInterrupt) as error:
+                interrupted = isinstance(error, KeyboardInterrupt)
+                # A live source that comes last has no other end, and so there is no rest.
+                self.whole = self.endless and source is self.sources[-1]
         return PredictReport(
             images=self.images,
             videos=self.videos,
@@ -568,6 +570,7 @@ class _Job:
             except InputError as error:
                 self.failures.append(Failure(source.name, str(error)))
                 return
+        self.endless = isinstance(source, FrameReader) and source.live
         name = "images" if isinstance(source, Stills) else PurePath(source.name).name
         total = len(source.paths) if isinstance(source, Stills) else source.expected
         task = progress.add_task(name, total=total)
@@ -602,7 +605,8 @@ class _Job:
                             self._take(perception, road, video)
                     progress.advance(task)
                 if isinstance(source, FrameReader):
-                    for writer in self.writers:
+                    # What another run left of other parts of the video stays.
+                    for writer in self.writers if self.clip == Clip(every=self.clip.every) else ():
                         writer.remove_remains(source.name)
                     self.unfinished[source.name] = False
             except InputError as error:

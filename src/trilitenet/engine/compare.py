@@ -208,7 +208,8 @@ def _spread(report: Report, resamples: int, seed: int, groups: Sequence[int] | N
 def _why_unpaired(first: Report, other: Report) -> dict[str, str]:
     """Say why figures of two reports cannot be compared image by image: part of their keys -> the reason."""
     if len(set(first.groups or first.names)) == 1:
-        return {"": f"drawn from {first.drawn}"}
+        cure = "; evaluate with --group image to draw each by itself" if first.groups else ""
+        return {"": f"drawn from {first.drawn}{cure}"}
     if first.names != other.names:
         return {"": f"measured on other images ({len(other.names)}, the first on {len(first.names)})"}
     hashes = [report.provenance.data_sha256 for report in (first, other)]

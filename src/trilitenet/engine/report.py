@@ -236,7 +236,7 @@ class Report:
             return "1 image, which gives none" if len(self.names) == 1 else f"{len(self.names)} images"
         count = len(set(self.groups))
         if count == 1:
-            return f"1 group of images (by {self.group}), which gives none; --group image draws each by itself"
+            return f"1 group of images (by {self.group}), which gives none"
         return f"{count} groups of images (by {self.group})"
 
     @property
@@ -299,7 +299,8 @@ class Report:
         for protocol in self.protocols:
             tables.append(_figure_table(protocol, self.figures))
         if any(figure.low is not None for figure in self.figures.values()):
-            tables.append(Text(f"intervals: drawn from {self.drawn}"))
+            alone = "; --group image draws each by itself" if len(set(self.groups)) == 1 else ""
+            tables.append(Text(f"intervals: drawn from {self.drawn}{alone}"))
         tables.append(_exclusions(self))
         tables += [_condition_table(protocol, self.conditions) for protocol in self.protocols if self.conditions]
         tables += _variation_tables(self.variations)

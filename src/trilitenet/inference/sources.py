@@ -398,6 +398,14 @@ class _UrlReader(VideoReader, StreamReader):
     def __init__(self, url: str, clip: Clip | None = None) -> None:
         super().__init__(url, clip, timeout=_PATIENCE, unopened=True)
         self._url = url  # whole: `VideoReader` passes the name on
+        self._live = True
+
+    @property
+    def live(self) -> bool:  # type: ignore[override]
+        """See `FrameReader`; it is found out when asked for."""
+        if self._unopened:
+            self.look()
+        return self._live
 
     def look(self) -> None:
         """Find out which it is, and of a file ``rate`` and ``expected``.
@@ -406,14 +414,12 @@ class _UrlReader(VideoReader, StreamReader):
             InputError: If it cannot be read.
         """
         with self._open() as container:
-            self.live = not _has_end(container)
-        if not self.live:
-            super().look()
+            self._live = not _has_end(container)
         self._unopened = False
+        if not self._live:
+            super().look()
 
     def _decode(self) -> Any:
-        if self._unopened:
-            self.look()
         return StreamReader._decode(self) if self.live else VideoReader._decode(self)
 
 

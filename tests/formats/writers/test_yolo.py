@@ -82,7 +82,8 @@ def test_what_an_earlier_run_left_of_a_video_goes_once_it_is_done(tmp_path: Path
     labels = tmp_path / "labels"
     labels.mkdir()
     mine = {"drive.txt", "drive-000009.txt", "drive-x-0000009.txt", "other-0000009.txt", "drive-0000009.csv"}
-    left = {"drive-0000003.txt", "drive-0000009.txt", "drive-12345678.txt"}
+    mine |= {"drive-20240101.txt", "new-0000009.txt"}
+    left = {"drive-0000001.txt", "drive-0000003.txt", "drive-0000009.txt"}
     for name in mine | left:
         (labels / name).touch()
     with YoloWriter(tmp_path, overwrite=True) as writer:
@@ -93,5 +94,7 @@ def test_what_an_earlier_run_left_of_a_video_goes_once_it_is_done(tmp_path: Path
         assert {path.name for path in labels.iterdir()} == {"drive-0000000.txt", "drive-0000001.txt"} | mine | left
         writer.write(video[3])
         writer.remove_remains("drive.mp4")
-    written = {f"drive-000000{index}.txt" for index in (0, 1, 3)}
+        writer.write(dataclasses.replace(video[0], source="new.mp4"))
+        writer.remove_remains("new.mp4")  # nothing of it was replaced: of what run, if any, the other is nobody knows
+    written = {f"drive-000000{index}.txt" for index in (0, 1, 3)} | {"new-0000000.txt"}
     assert {path.name for path in labels.iterdir()} == written | mine

@@ -67,6 +67,8 @@ class Writer(abc.ABC):
     """A package that it needs, and the extra that installs it."""
     FILES: ClassVar[tuple[str, ...]] = ()
     """Names of the files that it writes whatever it is given."""
+    GATHERS: ClassVar[bool] = True
+    """Whether those hold what is of each source, not just what they have in common."""
     PICTURE_FILES: ClassVar[tuple[str, ...]] = ()
     """Names of the files that it writes for a picture; ``{}`` is the source's `stem`."""
     VIDEO_FILES: ClassVar[tuple[str, ...]] = ()

@@ -33,6 +33,7 @@ class YoloWriter(Writer):
     """
 
     FILES = ("data.yaml",)
+    GATHERS = False
     PICTURE_FILES = ("labels/{}.txt",)
     VIDEO_FILES = ("labels/{}-*.txt",)
 
@@ -41,6 +42,7 @@ class YoloWriter(Writer):
         self.confidence = confidence
         self._class_names: tuple[str, ...] | None = None
         self._remains: dict[str, set[Path]] = defaultdict(set)
+        self._replaced: set[str] = set()
         if overwrite:
             for path in (output / "labels").glob("*.txt"):
                 if video := _video_of(path):
@@ -60,16 +62,20 @@ class YoloWriter(Writer):
             values = " ".join(f"{value:.6f}" for value in box)
             lines.append(f"{class_id} {values}" + (f" {score:.4f}" if self.confidence else "") + "\n")
         self.write_whole(path, "".join(lines))
-        if video := _video_of(path):
-            self._remains[video].discard(path)
+        if (video := _video_of(path)) and path in self._remains[video]:
+            self._remains[video].remove(path)
+            self._replaced.add(video)
         self._class_names = perception.class_names
 
     def remove_remains(self, source: str) -> None:
-        """Remove the labels that an earlier run left of other frames of a video, if this one looked for boxes."""
-        if self._class_names is not None:
-            for path in self._remains.pop(self.stem(source), ()):
-                with writing(path):
-                    path.unlink(missing_ok=True)
+        """Remove the labels that an earlier run left of other frames of a video.
+
+        There was such a run only if this one has replaced some; other files may be called alike.
+        """
+        stem = self.stem(source)
+        for path in self._remains.pop(stem, ()) if stem in self._replaced else ():
+            with writing(path):
+                path.unlink(missing_ok=True)
 
     def _close(self) -> None:
         """Write ``data.yaml``."""
@@ -82,5 +88,5 @@ class YoloWriter(Writer):
 
 def _video_of(labels: Path) -> str | None:
     """Return the stem of the video of which a label file, by its name, has a frame."""
-    frame = re.fullmatch(r"(.+)-\d{7,}", labels.stem)
+    frame = re.fullmatch(r"(.+)-\d{7}", labels.stem)
     return None if frame is None else frame[1]
