@@ -80,6 +80,7 @@ class Node:
         self.publishers: dict[str, Publisher] = {}
         self.subscriptions: dict[str, Any] = {}
         self.messages: list[str] = []
+        self.looks = 0
         self.settable: set[str] = set()
 
     overrides: ClassVar[dict[str, Any]] = {}
@@ -94,6 +95,12 @@ class Node:
         if descriptor is None or not descriptor.read_only:
             self.settable.add(name)
         return types.SimpleNamespace(value=value)
+
+    def get_clock(self) -> Any:
+        """Return a clock that goes on by a second each time it is looked at."""
+        self.looks += 1
+        now = types.SimpleNamespace(sec=1000 + self.looks, nanosec=0)
+        return types.SimpleNamespace(now=lambda: types.SimpleNamespace(to_msg=lambda: now))
 
     def create_publisher(self, kind: type, topic: str, depth: int) -> Publisher:
         self.publishers[topic] = Publisher()

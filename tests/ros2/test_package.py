@@ -164,6 +164,24 @@ def test_the_node_publishes_what_is_seen(node_module: Any, monkeypatch: pytest.M
     assert "(0, 160, 3)" in node.messages[-1]
 
 
+def test_pictures_without_a_stamp_are_as_far_apart_as_they_come(
+    node_module: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trilitenet.load", lambda model, **options: Predictor(_Backend()), raising=False)
+    node = node_module.PerceptionNode()
+    seen: list[float] = []
+    monitor = node._monitor
+
+    def noted(perception: Any) -> Any:
+        seen.append(perception.timestamp)
+        return monitor(perception)
+
+    monkeypatch.setattr(node, "_monitor", noted)
+    for _ in range(3):
+        node.subscriptions["image"](_image("bgr8", np.zeros((96, 160, 3), np.uint8)))
+    assert seen == [0.0, 1.0, 2.0]
+
+
 def test_a_model_without_detection_publishes_no_detections(node_module: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     backend = _Backend()
     monkeypatch.setattr(backend, "run", lambda batch: RawOutputs(None, *(np.zeros(batch.shape[:3], np.uint8),) * 2))

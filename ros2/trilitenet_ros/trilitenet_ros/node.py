@@ -76,7 +76,10 @@ class PerceptionNode(Node):
 
     def _see(self, message: Image) -> None:
         pixels = read_image(message)
-        seconds = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+        stamp = message.header.stamp
+        if not (stamp.sec or stamp.nanosec):  # the camera does not say when: by the time of arrival
+            stamp = self.get_clock().now().to_msg()
+        seconds = stamp.sec + stamp.nanosec * 1e-9
         self._start = seconds if self._start is None else self._start
         perception = dataclasses.replace(self._predictor(pixels), frame=self._frame, timestamp=seconds - self._start)
         self._frame += 1

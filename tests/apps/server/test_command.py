@@ -103,7 +103,7 @@ def test_settings_must_fit_each_other() -> None:
         Settings(queue=4, max_images=5)
     with pytest.raises(ConfigError, match="memory"):
         Settings(max_pixels=200_000_000)
-    least = 2 * 1000 + 10 * 500  # the body twice, as it is and in parts, and the picture
+    least = 2 * 1000 + 13 * 500  # the body twice, as it is and in parts, the picture, and an overlay
     assert Settings(max_body=1000, max_pixels=500, memory=least).memory == least
     with pytest.raises(ConfigError, match=f"memory .* must be at least {least}"):
         Settings(max_body=1000, max_pixels=500, memory=least - 1)

@@ -297,7 +297,7 @@ def _binary(shape: list[int], data: bytes, datatype: str = "UINT8", **more: Any)
 
 
 def test_the_images_of_a_request_are_paid_for(make_app: MakeApp) -> None:
-    with TestClient(make_app(memory=220_000, max_body=100_000, max_pixels=2000)) as client:
+    with TestClient(make_app(memory=226_000, max_body=100_000, max_pixels=2000)) as client:
         for count, status in ((4, 200), (16, 413)):  # 10 bytes a pixel: 80 kB, and 320 kB, beside the body
             request = _binary([count, 40, 50, 3], bytes(count * 6000))
             answer = client.post("/v2/models/tiny/infer", **request)
@@ -308,7 +308,7 @@ def test_the_images_of_a_request_are_paid_for(make_app: MakeApp) -> None:
 def test_what_follows_the_json_is_paid_for_twice(make_app: MakeApp, jpeg: bytes) -> None:
     film = jpeg + bytes(60_000)  # few pixels, many bytes
     request = _binary([1], struct.pack("<I", len(film)) + film, "BYTES")
-    app = make_app(memory=300_000, max_body=100_000, max_pixels=10_000)
+    app = make_app(memory=300_000, max_body=100_000, max_pixels=7_000)
     with TestClient(app) as client:
         for taken, status in ((120_000, 200), (180_000, 503)):  # by others; once would fit beside either
             app.service.memory.take(taken)

@@ -27,6 +27,7 @@ from selenium.webdriver.support.ui import WebDriverWait
 from tests.apps.server.conftest import TOKEN, FakeBackend, Running, encode, picture
 from trilitenet.apps.server.application import create_app
 from trilitenet.apps.server.problems import BusyError
+from trilitenet.apps.server.service import Encoded
 from trilitenet.apps.server.settings import Settings
 from trilitenet.config import TASKS, Task, Thresholds
 from trilitenet.formats.writers.native import read_schema
@@ -555,7 +556,28 @@ def test_frames_for_which_there_was_no_time_are_asked_for_again(
     page.wait(lambda: page["progress-row"].is_displayed())
     page.wait(lambda: not page["progress-row"].is_displayed() and page["player"].is_displayed())
     assert not page["error"].is_displayed()
-    assert len(asked) == 8 + int(page["seek"].get_attribute("max")) + 1
+    assert len(asked) == int(page["seek"].get_attribute("max")) + 2  # that frame alone
+
+
+def test_a_webp_that_exif_may_turn_is_sent_as_it_is_shown(
+    page: Page, server: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    see = server.app.service.see
+    sent: list[tuple[str, int, int]] = []
+
+    async def noted(image: Encoded, *arguments: Any, **options: Any) -> Any:
+        sent.append((image.header.kind, image.header.width, image.header.height))
+        return await see(image, *arguments, **options)
+
+    monkeypatch.setattr(server.app.service, "see", noted)
+    turn = Image.Exif()
+    turn[0x0112] = 6
+    Image.new("RGB", (64, 48)).save(tmp_path / "turned.webp", exif=turn)
+    Image.new("RGB", (64, 48)).save(tmp_path / "plain.webp")
+    for name in ("turned", "plain"):
+        page.choose(tmp_path / f"{name}.webp")
+        page.wait(lambda: len(sent) == (1 if name == "turned" else 2))  # noqa: B023 - called here alone
+    assert sent == [("JPEG", 64, 48), ("WEBP", 64, 48)]
 
 
 def test_a_clip_can_be_stopped(page: Page, clip: Path) -> None:

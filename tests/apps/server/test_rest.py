@@ -19,7 +19,7 @@ from starlette.testclient import TestClient
 from tests.apps.server.conftest import TOKEN, FakeBackend, MakeApp, encode, picture
 from trilitenet.apps.server.application import Application, create_app
 from trilitenet.apps.server.guard import PUBLIC_PATHS
-from trilitenet.apps.server.intake import Header, read_header
+from trilitenet.apps.server.intake import Header, Reservation, read_header
 from trilitenet.apps.server.openapi import BatchPrediction, Prediction, ProtocolErrorAnswer
 from trilitenet.config import ArtefactInfo
 from trilitenet.inference.predictor import Predictor
@@ -399,13 +399,33 @@ def test_a_batch_that_would_fit_later_is_refused_as_a_whole(make_app: MakeApp) -
     assert answer.headers["retry-after"] == "1"
 
 
+def test_an_overlay_is_paid_for_beside_the_picture(
+    client: TestClient, jpeg: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[int] = []
+    take = Reservation.take
+
+    def noted(self: Reservation, size: int) -> None:
+        taken.append(size)
+        take(self, size)
+
+    monkeypatch.setattr(Reservation, "take", noted)
+    paid = []
+    for output in ("json", "overlay"):
+        taken.clear()
+        assert client.post(f"/v1/predict?format={output}", content=jpeg).status_code == 200
+        paid.append(sum(taken))
+    height, width = picture().shape[:2]
+    assert paid[1] - paid[0] == 3 * height * width
+
+
 def test_the_parts_of_a_form_are_paid_for_beside_it(make_app: MakeApp) -> None:
     small = encode(picture(20, 20), "PNG")
-    large = small + bytes(90_000)
-    with TestClient(make_app(memory=210_000, max_body=100_000, max_pixels=1000)) as client:
+    large = small + bytes(91_500)
+    with TestClient(make_app(memory=213_000, max_body=100_000, max_pixels=1000)) as client:
         files = [("images", ("a", large)), *[("images", ("b", small))] * 7]
         answer = client.post("/v1/predict/batch", files=files)
-    # Twice 90 kB and a little, and 4 kB a picture: the last one is too much.
+    # Twice 91.5 kB and a little, and 4 kB a picture: the last one is too much.
     assert [result["status"] for result in answer.json()["results"]][:4] == [200] * 4
     assert answer.json()["results"][-1]["error"]["code"] == "too_much_memory"
 

@@ -23,6 +23,7 @@ from trilitenet.apps.server.intake import Reservation, check_header, read_body, 
 from trilitenet.apps.server.multipart import split_form
 from trilitenet.apps.server.problems import BusyError, ProblemError
 from trilitenet.apps.server.service import Encoded, Outcome, Service, together
+from trilitenet.apps.server.settings import DRAWING_BYTES_PER_PIXEL
 from trilitenet.errors import did_you_mean
 from trilitenet.processing.drawing import DRIVABLE_COLOUR, LANE_COLOUR
 from trilitenet.structures import Perception
@@ -56,6 +57,8 @@ def rest_router(service: Service) -> APIRouter:
         reservation = request.scope["state"]["reservation"]
         (data,) = await _encoded(request, service, reservation, most=1)
         image = _checked(data, service, reservation)
+        if output == "overlay":
+            reservation.take(image.header.width * image.header.height * DRAWING_BYTES_PER_PIXEL)
         finish = _finisher(output, request, service)
         with service.admit(1) as deadline:
             work = service.see(image, deadline, finish, confidence, keep_image=output == "overlay")

@@ -9,13 +9,16 @@ from typing import Final
 from trilitenet.errors import ConfigError
 from trilitenet.processing.cores import usable_cores
 
-__all__ = ["BYTES_PER_PIXEL", "WEBP_BYTES_PER_PIXEL", "Settings"]
+__all__ = ["BYTES_PER_PIXEL", "DRAWING_BYTES_PER_PIXEL", "WEBP_BYTES_PER_PIXEL", "Settings"]
 
 BYTES_PER_PIXEL: Final = 10
-"""Memory that one pixel of an accepted image may take while it is worked on: decoder, RGB copy, masks, drawing."""
+"""Memory that one pixel of an accepted image may take while it is worked on: decoder, RGB copy, masks."""
 
 WEBP_BYTES_PER_PIXEL: Final = 17
 """The same for WebP, whose decoder keeps several copies."""
+
+DRAWING_BYTES_PER_PIXEL: Final = 3
+"""What an overlay takes beside."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +78,7 @@ class Settings:
             if field.type == "float" and not (0 < value < math.inf or (lowest == 0 and value == 0)):
                 allowed = "positive" if lowest else "at least 0"
                 raise ConfigError(f"{field.name} must be {allowed} and finite, got {value}")
-        needed = 2 * self.max_body + BYTES_PER_PIXEL * self.max_pixels
+        needed = 2 * self.max_body + (BYTES_PER_PIXEL + DRAWING_BYTES_PER_PIXEL) * self.max_pixels
         if needed > self.memory:
             raise ConfigError(
                 f"memory ({self.memory}) must be at least {needed}, for one image of max_pixels ({self.max_pixels}) "

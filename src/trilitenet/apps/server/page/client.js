@@ -51,10 +51,7 @@ function sentence(text) {
 async function patiently(path, options) {
   for (let attempt = 0; ; attempt += 1) {
     try {
-      const answer = await ask(path, options);
-      const busy = answer.results?.find((result) => result.status === 503);
-      if (busy) throw new ServiceError(503, sentence(busy.error.message));
-      return answer;
+      return await ask(path, options);
     } catch (error) {
       if (error.status !== 503 || attempt === 4) throw error;
       await pause(1000 * error.wait, options.signal);
@@ -93,12 +90,22 @@ export async function predict(blob, floor, signal) {
   return { ...result, roundTrip: performance.now() - started };
 }
 
-/** See several pictures in one request. */
+/** See several pictures in one request; those for which there was no time are asked for again, and they alone. */
 export async function predictBatch(blobs, floor, signal) {
-  const form = new FormData();
-  for (const blob of blobs) form.append("images", blob);
   const started = performance.now();
-  const { results } = await patiently(`v1/predict/batch?confidence=${floor}`, { method: "POST", body: form, signal });
+  const results = [];
+  let left = [...blobs.keys()];
+  for (let idle = 0; left.length; ) {
+    const form = new FormData();
+    for (const index of left) form.append("images", blobs[index]);
+    const answer = await patiently(`v1/predict/batch?confidence=${floor}`, { method: "POST", body: form, signal });
+    left.forEach((index, place) => (results[index] = answer.results[place]));
+    const busy = left.filter((index) => results[index].status === 503);
+    idle = busy.length < left.length ? 0 : idle + 1;
+    if (idle === 5) throw new ServiceError(503, sentence(results[busy[0]].error.message));
+    left = busy;
+    if (left.length) await pause(1000, signal);
+  }
   const roundTrip = (performance.now() - started) / blobs.length;
   return results.map((result) => {
     if (result.status !== 200) throw new ServiceError(result.status, sentence(result.error.message));

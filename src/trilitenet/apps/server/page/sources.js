@@ -16,10 +16,16 @@ export async function openPhoto(file) {
     return { blob: file, picture: null }; // the service says what is wrong with it
   }
   const longest = Math.max(picture.width, picture.height);
-  if (SENT_AS_IS.includes(file.type) && longest <= LONGEST.photo && file.size <= LARGEST_UPLOAD) {
+  if (SENT_AS_IS.includes(file.type) && !(await mayBeTurned(file)) && longest <= LONGEST.photo && file.size <= LARGEST_UPLOAD) {
     return { blob: file, picture };
   }
   return shrink(picture, picture.width, picture.height, LONGEST.photo, 0.92);
+}
+
+/** Whether EXIF may turn a WebP: the service does so, browsers do not, and what is shown must be what is seen. */
+async function mayBeTurned(file) {
+  const [flags] = new Uint8Array(await file.slice(20, 21).arrayBuffer());
+  return file.type === "image/webp" && Boolean(flags & 8);
 }
 
 /** Draw a source no larger than `longest`, and return { blob, picture }. */
