@@ -501,3 +501,29 @@ def test_an_interruption_before_the_command_line_is_there_is_no_traceback(tmp_pa
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
     done = subprocess.run([sys.executable, "-m", "trilitenet"], capture_output=True, text=True, env=environment)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "error: interrupted\n")
+
+
+@pytest.mark.parametrize("words", [["--help", "predict"], ["-h", "weights", "info"]])
+def test_help_before_a_command_is_the_command_s(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(words) == 0
+    before = capsys.readouterr().out
+    assert cli.main([*words[1:], words[0]]) == 0
+    assert before == capsys.readouterr().out
+    assert "--json-output" in before or "--overwrite" in before
+
+
+def test_help_into_a_closed_pipe_is_no_error() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "wb") as pipe:
+        done = subprocess.run(
+            [sys.executable, "-m", "trilitenet", "predict", "--help"], stdout=pipe, stderr=subprocess.PIPE, timeout=60
+        )
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_a_number_that_no_machine_has_is_told_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["predict", "a.jpg", "--batch-size", "1" + 20 * "0"]) == 2
+    error = capsys.readouterr().err
+    assert "is larger than any number here" in error
+    assert error.count("\n") == 1

@@ -247,3 +247,19 @@ def test_suppression_inside_at_an_iou_of_0_leaves_boxes_that_do_not_touch(runtim
         core = openvino_core(pytest.importorskip("openvino"))
         kept = core.compile_model(core.read_model(model.SerializeToString(), b""), "CPU")([rows])[0]
     np.testing.assert_allclose(kept[0], rows[0, [0, 2]], rtol=1e-2)
+
+
+def test_an_interruption_while_pytorch_imports_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        try:
+            try:
+                raise KeyboardInterrupt
+            finally:
+                raise AttributeError("module 'torch._dynamo' has no attribute 'exc'")
+        except AttributeError as error:
+            raise RuntimeError("cannot be exported") from error
+
+    monkeypatch.setattr(torch.onnx, "export", interrupted)
+    network = lively_network()
+    with pytest.raises(KeyboardInterrupt):
+        build_onnx(DeployGraph(network), network.card, ArtefactInfo("onnx", size=SIZE))

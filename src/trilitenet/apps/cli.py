@@ -97,7 +97,8 @@ _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 """Characters that end a line or control a terminal."""
 _HYPHEN: Final = "\0"
 """Stands for a lone hyphen, which the parser takes for an option without a name; no word that is typed holds it."""
-_ROOT_OPTIONS: Final = ("--help", "-h", "--version")
+_HELP: Final = ("--help", "-h")
+_ROOT_OPTIONS: Final = (*_HELP, "--version")
 _SPARING: Final = {"evaluate", "evaluate-table", "predict", "serve"}
 """Commands that run a network, neither to train it nor to measure how fast it is."""
 _SPINS: Final = "10000"
@@ -111,6 +112,9 @@ def build_app(words: Sequence[str] = ()) -> cyclopts.App:
     Args:
         words: What the user typed: only the command that they name is imported.
     """
+    helps = not words or any(word in _HELP for word in words)
+    while words and words[0] in _HELP:  # before the command as well as behind it
+        words = words[1:]
     app = cyclopts.App(
         name="trilitenet",
         help="Light driving perception: vehicles, drivable area and lane lines from one tiny network.",
@@ -119,6 +123,7 @@ def build_app(words: Sequence[str] = ()) -> cyclopts.App:
         default_parameter=cyclopts.Parameter(negative_iterable=(), converter=_converted),
         help_on_error=False,
         suppress_keyboard_interrupt=False,
+        console=_help_console() if helps else None,
     )
     groups = {name: cyclopts.App(name=name, help=text) for name, text in GROUPS.items()}
     called = next((c for c in COMMANDS if list(words[: len(c.words.split())]) == c.words.split()), None)
@@ -135,6 +140,17 @@ def build_app(words: Sequence[str] = ()) -> cyclopts.App:
     return app
 
 
+def _help_console() -> Any:
+    """Return the console that help is written to."""
+    from rich.console import Console
+
+    class HelpConsole(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError  # not SystemExit(1): `main` tells nothing of a reader that has gone
+
+    return HelpConsole()
+
+
 def _converted(type_: Any, tokens: Sequence[cyclopts.Token]) -> Any:
     """Convert words as the parser does, with a lone hyphen among them, but round no fraction to a whole number."""
     hyphen = next((token for token in tokens if token.value == _HYPHEN and token.keyword is not None), None)
@@ -149,6 +165,9 @@ def _converted(type_: Any, tokens: Sequence[cyclopts.Token]) -> Any:
         fraction = next((token for token in tokens if "." in token.value), None)
         if fraction is not None:
             raise cyclopts.CoercionError(token=fraction, target_type=int)
+        large = next((t for t in tokens if t.keyword != "--seed" and len(t.value.lstrip("+-0")) > 18), None)
+        if large is not None:
+            raise cyclopts.CoercionError(token=large, msg=f"{large.value[:20]}... is larger than any number here")
     return cyclopts.convert(type_, tokens)
 
 

@@ -69,6 +69,11 @@ def build_onnx(
             assert program is not None
             model = program.model_proto
     except (RuntimeError, torch.onnx.errors.OnnxExporterError) as error:
+        cause: BaseException | None = error
+        while cause is not None:
+            if isinstance(cause, KeyboardInterrupt):  # PyTorch, interrupted while it imports, raises others for it
+                raise cause from None
+            cause = cause.__cause__ or cause.__context__
         raise BackendError(f"PyTorch cannot trace the deploy graph ({_reason(error)})") from error
     if nms is not None:
         _append_nms(onnx, model, card.classes, nms)
