@@ -554,12 +554,11 @@ def test_a_live_source_that_comes_last_leaves_no_rest_behind(
     tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source, output = drive(tmp_path / "drive.mp4", frames=6), tmp_path / "out"
-    write, done = YoloWriter._write, itertools.count(1)
+    write = YoloWriter._write
 
     def interrupted(self: YoloWriter, *arguments: Any) -> None:
         write(self, *arguments)
-        if next(done) % 2 == 0:
-            signal.default_int_handler(signal.SIGINT, None)
+        signal.default_int_handler(signal.SIGINT, None)
 
     monkeypatch.setattr(YoloWriter, "_write", interrupted)
     for live in (False, True):
@@ -569,6 +568,24 @@ def test_a_live_source_that_comes_last_leaves_no_rest_behind(
         assert [path.name for path in report.partial] == ([] if live else ["perceptions.jsonl"])
         marks = {path.name for path in (output / str(live)).glob("*.part")} - {"drive.unfinished.part"}
         assert marks == (set() if live else {"perceptions.jsonl.unfinished.part"})
+
+
+def test_a_source_that_is_not_opened_yet_is_a_rest_though_a_live_one_came_before(
+    tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, other = (drive(tmp_path / f"{name}.mp4", frames=2) for name in ("a", "b"))
+    monkeypatch.setattr(VideoReader, "live", True)
+    look = VideoReader.look
+
+    def interrupted(self: VideoReader) -> None:
+        if self.name == str(other):
+            raise KeyboardInterrupt
+        look(self)
+
+    monkeypatch.setattr(VideoReader, "look", interrupted)
+    report = predict_with(predictor, [one, other], tmp_path / "out", format=("jsonl",), overlay=False)
+    assert report.frames > 0
+    assert [path.name for path in report.partial] == ["perceptions.jsonl"]
 
 
 @pytest.mark.parametrize("format", ["jsonl", "csv", "coco", "yolo", "cvat"])

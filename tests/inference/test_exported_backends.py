@@ -369,6 +369,11 @@ def test_openvino_with_the_weights_of_another_export(artefacts: Artefacts, tmp_p
     (tmp_path / "model.bin").write_bytes(weights)
     with pytest.raises(WeightsError, match=r"model\.bin: not the weights that model\.xml was written for"):
         OpenVINOBackend(tmp_path / "model.xml")
+    (tmp_path / "model.bin").write_bytes(np.random.default_rng(0).bytes(len(weights)))  # axes that are none, and such
+    with pytest.raises(WeightsError, match=r"model\.bin: not the weights that model\.xml was written for"):
+        OpenVINOBackend(tmp_path / "model.xml")
+    weights[len(weights) // 2] ^= 1
+    (tmp_path / "model.bin").write_bytes(weights)
     graph = (tmp_path / "model.xml").read_text(encoding="utf-8")
     older = re.sub(r"<weights_sha256 [^>]*/>", "", graph)
     assert older != graph

@@ -564,6 +564,7 @@ class _Job:
         )
 
     def _run_source(self, source: Stills | FrameReader, predictor: Predictor, progress: Progress) -> None:
+        self.endless = False
         if isinstance(source, FrameReader):
             try:
                 source.look()

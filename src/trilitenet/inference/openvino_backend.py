@@ -8,6 +8,7 @@ import functools
 import hashlib
 import os
 import queue
+import re
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -82,12 +83,11 @@ class OpenVINOBackend(ArtefactBackend):
                 reason = "cut off or damaged; export it again"
             elif "is_valid_weights_range" in said or "Incorrect weights" in said:
                 reason = f"{weights.name} is cut off, or of another file; export it again"
+            else:
+                _check_weights(path)  # those of another graph are told by what they are read as
             raise WeightsError(f"{path}: not a usable OpenVINO or ONNX model ({reason})") from error
-        metadata = _metadata(model)
-        self._card, self.info = read_metadata(metadata, str(path))
-        wanted_weights = metadata.get(WEIGHTS_HASH_KEY)
-        if wanted_weights is not None and hashlib.sha256(weights.read_bytes()).hexdigest() != wanted_weights:
-            raise WeightsError(f"{weights}: not the weights that {path.name} was written for; export the model again")
+        self._card, self.info = read_metadata(_metadata(model), str(path))
+        _check_weights(path)
         shapes = [
             [] if each.rank.is_dynamic else [None if side.is_dynamic else side.get_length() for side in each]
             for each in (entry.partial_shape for entry in model.inputs)
@@ -217,10 +217,25 @@ def _requests(compiled: Any, count: int) -> queue.SimpleQueue[Any]:
     return idle
 
 
+def _check_weights(path: Path) -> None:
+    """Refuse weights beside a graph that are not those whose hash it holds; older graphs hold none.
+
+    Raises:
+        WeightsError: If they are of another export.
+    """
+    if path.suffix.lower() != ".xml":
+        return
+    weights = path.with_suffix(".bin")
+    key = WEIGHTS_HASH_KEY.rpartition(".")[2].encode()
+    held = re.search(rb"<" + key + rb' value="([0-9a-f]+)"', path.read_bytes())
+    if held is not None and hashlib.sha256(weights.read_bytes()).hexdigest() != held[1].decode():
+        raise WeightsError(f"{weights}: not the weights that {path.name} was written for; export the model again")
+
+
 def _metadata(model: Any) -> dict[str, str]:
     """Return an OpenVINO model's own key-value pairs, wherever the format keeps them."""
     found = {}
-    for key in (CARD_KEY, ARTEFACT_KEY, WEIGHTS_HASH_KEY):
+    for key in (CARD_KEY, ARTEFACT_KEY):
         for path in (key.split("."), ["framework", key], ["framework", *key.split(".")]):
             if model.has_rt_info(path):
                 found[key] = str(model.get_rt_info(path).astype(str))

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.request
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -615,6 +616,7 @@ def test_a_model_that_fails_at_the_start_is_one_line(
 def test_a_second_ctrl_c_ends_at_once_without_a_traceback() -> None:
     process, port = _start_script()
     assert process.stderr is not None
+    urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz").close()  # signalled before, it would end at once
     with socket.create_connection(("127.0.0.1", port)) as connection:
         connection.sendall(b"POST /v1/predict HTTP/1.1\r\nhost: x\r\ncontent-length: 1000\r\n\r\nx")
         process.send_signal(signal.SIGINT)
