@@ -27,6 +27,7 @@ __all__ = [
     "CARD_KEY",
     "CARD_SCHEMA",
     "DEFAULT_ANCHORS",
+    "DYNAMIC_SIDES",
     "IMAGE_MEAN",
     "IMAGE_STD",
     "LONG_SIDE",
@@ -71,6 +72,8 @@ STRIDES: Final = (8, 16, 32)
 """Input pixels a cell of P3, P4 and P5."""
 MAX_STRIDE: Final = 32
 """Height and width of the network's input are multiples of this."""
+DYNAMIC_SIDES: Final = (64, 4096)
+"""Pixels of the least and the greatest side that a graph of any size is traced for; ``.pt2`` refuses others."""
 LONG_SIDE: Final = 640
 """Pixels the longer side of an image is resized to by default (Section IV-A: 1280x720 becomes 640x384)."""
 

@@ -38,6 +38,13 @@ BACKENDS = [
 ]
 
 
+def need(kind: type) -> None:
+    """Skip the test where what makes and runs such artefacts is not installed."""
+    if kind is NcnnBackend:
+        pytest.importorskip("pnnx")
+        pytest.importorskip("ncnn")
+
+
 @pytest.mark.parametrize(("name", "kind", "options", "pixels", "error"), BACKENDS)
 def test_equals_the_network(
     artefacts: Artefacts, name: str, kind: Any, options: dict[str, Any], pixels: float, error: float
@@ -50,9 +57,7 @@ def test_equals_the_network(
     [("model.onnx", OnnxBackend), ("model.xml", OpenVINOBackend), ("model.ncnn.param", NcnnBackend)],
 )
 def test_in_parallel_gives_the_same(artefacts: Artefacts, name: str, kind: Any) -> None:
-    if kind is NcnnBackend:
-        pytest.importorskip("pnnx")
-        pytest.importorskip("ncnn")
+    need(kind)
     backend = kind(artefacts.folder / name, threads=3)
     images = [artefacts.images[index % len(artefacts.images)][None] for index in range(12)]
     alone = [backend.run(image) for image in images]
@@ -109,9 +114,7 @@ threads = [threading.Thread(target=work) for _ in range(2)]
     [("model.onnx", OnnxBackend), ("model.xml", OpenVINOBackend), ("model.ncnn.param", NcnnBackend)],
 )
 def test_a_predictor_goes_to_other_processes(artefacts: Artefacts, name: str, kind: Any) -> None:
-    if kind is NcnnBackend:
-        pytest.importorskip("pnnx")
-        pytest.importorskip("ncnn")
+    need(kind)
     predictor = trilitenet.Predictor(kind(artefacts.folder / name, threads=1), batch_size=3)
     again = pickle.loads(pickle.dumps(predictor))  # noqa: S301 - its own
     assert (again.backend.name, again.batch_size) == (predictor.backend.name, 3)
@@ -128,9 +131,7 @@ def test_a_predictor_goes_to_other_processes(artefacts: Artefacts, name: str, ki
 def test_another_process_may_work_in_another_folder(
     artefacts: Artefacts, name: str, kind: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if kind is NcnnBackend:
-        pytest.importorskip("pnnx")
-        pytest.importorskip("ncnn")
+    need(kind)
     monkeypatch.chdir(artefacts.folder)
     data = pickle.dumps(kind(name))
     monkeypatch.chdir(tmp_path)
@@ -149,9 +150,7 @@ def test_another_process_may_work_in_another_folder(
 def test_a_model_stays_the_same_where_the_process_changes_its_folder(
     artefacts: Artefacts, name: str, kind: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if kind is NcnnBackend:
-        pytest.importorskip("pnnx")
-        pytest.importorskip("ncnn")
+    need(kind)
     monkeypatch.chdir(artefacts.folder)
     backend = kind(name, threads=2)
     monkeypatch.chdir(tmp_path)

@@ -26,6 +26,7 @@ from trilitenet.config import (
     ARTEFACT_KEY,
     ARTEFACT_SUFFIXES,
     CARD_KEY,
+    DYNAMIC_SIDES,
     ArtefactInfo,
     Masks,
     Precision,
@@ -119,7 +120,9 @@ class Exported:
 
     def summary(self) -> str:
         """Return the lines that the command line prints."""
-        anything = "any multiple of 32" + (" from 64 to 4096" if self.info.format == "torch" else "")
+        anything = "any multiple of 32" + (
+            " from {} to {}".format(*DYNAMIC_SIDES) if self.info.format == "torch" else ""
+        )
         size = anything if self.info.size is None else f"{self.info.size[1]}x{self.info.size[0]}"
         lines = [f"{self.path}: {self.info.format} {self.info.precision}, input {size} {self.info.colour.upper()}"]
         if self.parity is not None:

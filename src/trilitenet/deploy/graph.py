@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from trilitenet.config import MAX_STRIDE, STRIDES, ArtefactInfo, Masks, ModelCard, Thresholds
+from trilitenet.config import DYNAMIC_SIDES, MAX_STRIDE, STRIDES, ArtefactInfo, Masks, ModelCard, Thresholds
 from trilitenet.deploy.layers import (
     Activation,
     DepthwiseESPGraph,
@@ -588,7 +588,8 @@ class Traceable(nn.Module):
         self.image = torch.zeros(1, 3, height, width) if floats else torch.zeros(1, height, width, 3, dtype=torch.uint8)
         self.dynamic: tuple[dict[int, Any]] | None = None
         if info.size is None:
-            rows, columns = (MAX_STRIDE * torch.export.Dim(name, min=2, max=128) for name in ("rows", "columns"))
+            least, most = (side // MAX_STRIDE for side in DYNAMIC_SIDES)
+            rows, columns = (MAX_STRIDE * torch.export.Dim(name, min=least, max=most) for name in ("rows", "columns"))
             self.dynamic = ({2: rows, 3: columns} if floats else {1: rows, 2: columns},)
         self.eval()
 

@@ -25,6 +25,7 @@ from trilitenet.engine.scoring import FairMetrics, FairScores, PaperMetrics, Pap
 from trilitenet.errors import DataError, brief, write_file
 
 __all__ = [
+    "BY_IMAGE",
     "FEW_IMAGES",
     "REPORT_SCHEMA",
     "SAVED",
@@ -41,6 +42,8 @@ __all__ = [
 REPORT_SCHEMA: Final = 1
 """Version of the JSON; a file with a higher one is refused. docs/evaluation.md describes it."""
 SAVED: Final = "saved predictions"
+BY_IMAGE: Final = "image"
+"""In place of an attribute that makes groups: each image is drawn by itself."""
 FEW_IMAGES: Final = 30
 """A table cell from fewer images says little and is greyed."""
 
@@ -227,7 +230,7 @@ class Report:
     state: dict[str, Any] = dataclasses.field(repr=False)
     variations: tuple[Variation, ...] = ()
     groups: tuple[int, ...] = ()
-    group: str = "image"
+    group: str = BY_IMAGE
 
     @property
     def drawn(self) -> str:
@@ -452,7 +455,7 @@ def read_report(path: Path) -> Report:
             ),
             names=names,
             groups=_groups(mapping.get("groups", []), len(names)),
-            group=str(mapping.get("group", "image")),
+            group=str(mapping.get("group", BY_IMAGE)),
             state=state,
             variations=tuple(
                 Variation(

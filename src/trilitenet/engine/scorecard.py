@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from trilitenet.config import TASKS, Task, Thresholds
 from trilitenet.engine.overlays import error_overlay, shrunken
-from trilitenet.engine.report import Condition, DetectionPlots, Figure, Provenance, Report, WorstFrame
+from trilitenet.engine.report import BY_IMAGE, Condition, DetectionPlots, Figure, Provenance, Report, WorstFrame
 from trilitenet.engine.scoring import CanvasPrediction, FairMetrics, ImageOutcome, LabelledImage, PaperMetrics
 from trilitenet.errors import ConfigError, DataError, did_you_mean
 from trilitenet.metrics.bootstrap import bootstrap, interval
 from trilitenet.metrics.detection import DetectionMetric
 from trilitenet.structures import Perception
 
-__all__ = ["BY_IMAGE", "CONDITIONS", "GROUP", "PAPER_THRESHOLDS", "PROTOCOLS", "Scorecard"]
+__all__ = ["CONDITIONS", "GROUP", "PAPER_THRESHOLDS", "PROTOCOLS", "Scorecard"]
 
 _LOGGER: Final = logging.getLogger(__name__)
 
@@ -30,8 +30,6 @@ CONDITIONS: Final = ("timeofday", "weather", "scene")
 """Attributes that tables are made by, in the paper's order."""
 GROUP: Final = "sequence"
 """Attribute whose images are drawn together for the intervals: frames of one drive are much alike."""
-BY_IMAGE: Final = "image"
-"""In its place: each image by itself."""
 PAPER_THRESHOLDS: Final = Thresholds(confidence=0.001, iou=0.6, max_boxes=300, drivable=0.5, lane=0.5)
 """What the published evaluation decides with."""
 _CURVE_POINTS: Final = 400

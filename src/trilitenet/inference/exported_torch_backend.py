@@ -6,22 +6,19 @@ import logging
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, DYNAMIC_SIDES
 from trilitenet.errors import ShapeError, WeightsError
 from trilitenet.inference.backend import held
 from trilitenet.inference.exported import ArtefactBackend, prepare_input, read_metadata
 from trilitenet.inference.torch_backend import check_threads, pick_device
 
 __all__ = ["ExportedTorchBackend"]
-
-_SIDES: Final = (64, 4096)
-"""Pixels of the least and the greatest side that a program of any size was traced for."""
 
 
 class ExportedTorchBackend(ArtefactBackend):
@@ -77,9 +74,10 @@ class ExportedTorchBackend(ArtefactBackend):
         module = held(self._module, self._path)
         check_threads()
         height, width = batch.shape[1:3]
-        if self.info.size is None and not (_SIDES[0] <= min(height, width) and max(height, width) <= _SIDES[1]):
+        least, most = DYNAMIC_SIDES
+        if self.info.size is None and not (least <= min(height, width) and max(height, width) <= most):
             raise ShapeError(
-                f"a dynamic .pt2 takes sides from {_SIDES[0]} pixels to {_SIDES[1]}, got {width}x{height}: use the "
+                f"a dynamic .pt2 takes sides from {least} pixels to {most}, got {width}x{height}: use the "
                 "weights, or export it with a fixed --size"
             )
         with torch.no_grad():

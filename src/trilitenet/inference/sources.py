@@ -262,12 +262,15 @@ class VideoReader(FrameReader):
         if self._path == "-":
             return
         with self._open() as container:
-            stream = container.streams.video[0]
-            self.rate = _rate_of(container)
-            frames = stream.frames or None
-            if frames is None and container.duration and self.rate:
-                frames = round(container.duration / 1e6 * self.rate)
-            self.expected = self.clip.expected(frames, self.rate)
+            self._look_at(container)
+
+    def _look_at(self, container: Any) -> None:
+        stream = container.streams.video[0]
+        self.rate = _rate_of(container)
+        frames = stream.frames or None
+        if frames is None and container.duration and self.rate:
+            frames = round(container.duration / 1e6 * self.rate)
+        self.expected = self.clip.expected(frames, self.rate)
 
     def _open(self) -> Any:
         return _open_container(self._path, self.name, timeout=self._timeout)
@@ -415,9 +418,9 @@ class _UrlReader(VideoReader, StreamReader):
         """
         with self._open() as container:
             self._live = not _has_end(container)
+            if not self._live:
+                self._look_at(container)
         self._unopened = False
-        if not self._live:
-            super().look()
 
     def _decode(self) -> Any:
         return StreamReader._decode(self) if self.live else VideoReader._decode(self)

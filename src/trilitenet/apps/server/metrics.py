@@ -58,6 +58,8 @@ class Metrics:
             ["reason"],
             registry=self.registry,
         )
+        for reason in BUSY:  # no rise is seen in what begins with 1
+            self._rejects.labels(reason)
         self._vanished = Counter(
             "trilitenet_vanished", "Requests whose client went away before the answer.", registry=self.registry
         )
@@ -74,8 +76,6 @@ class Metrics:
         for route in routes:
             for status in ("500", "503"):
                 self._answers.labels(route, "POST", status)
-        for reason in BUSY:
-            self._rejects.labels(reason)
 
     def gauge(self, name: str, text: str, value: Callable[[], float]) -> None:
         """Add a gauge that is read when it is scraped."""

@@ -45,11 +45,11 @@ class CocoWriter(Writer):
         height, width = perception.size
         self._class_names = perception.class_names
         image_id = len(self._images) + 1
-        name = self.image_name(perception)
-        image: dict[str, Any] = {"id": image_id, "file_name": name, "width": width, "height": height}
+        file_name = self.image_name(perception)
+        image: dict[str, Any] = {"id": image_id, "file_name": file_name, "width": width, "height": height}
         video = 0
         if perception.frame is not None:
-            named = len(self._videos) + 1, name.rpartition("-")[0]
+            named = len(self._videos) + 1, self.stem(perception.source)
             video, _ = self._videos.setdefault(perception.source, named)
             image |= {"video_id": video, "frame_id": perception.frame}
         self._images.append(image)

@@ -24,8 +24,9 @@ export async function openPhoto(file) {
 
 /** Whether EXIF may turn a WebP: the service does so, browsers do not, and what is shown must be what is seen. */
 async function mayBeTurned(file) {
+  if (file.type !== "image/webp") return false;
   const [flags] = new Uint8Array(await file.slice(20, 21).arrayBuffer());
-  return file.type === "image/webp" && Boolean(flags & 8);
+  return Boolean(flags & 8);
 }
 
 /** Draw a source no larger than `longest`, and return { blob, picture }. */
