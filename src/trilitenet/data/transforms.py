@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from trilitenet.config import check_size
 from trilitenet.data import photometric
+from trilitenet.data.bonnet import bonnet
 from trilitenet.data.sample import BOXES, MASKS, VALID, Sample
 from trilitenet.errors import ConfigError
 from trilitenet.processing.boxes import clip_boxes
@@ -84,6 +85,7 @@ class Augmentation:
         rain: Probability of rain.
         fog: Probability of fog.
         night: Probability of darkness.
+        bonnet: Probability of the own car's bonnet or dashboard in view.
         mosaic: Probability that four samples share the canvas.
         mixup: Probability that a second sample shines through.
     """
@@ -102,6 +104,7 @@ class Augmentation:
     rain: float = 0.0
     fog: float = 0.0
     night: float = 0.0
+    bonnet: float = 0.0
     mosaic: float = 0.0
     mixup: float = 0.0
 
@@ -113,7 +116,7 @@ class Augmentation:
         for name in ("rotation", "translation", "hue", "saturation", "value"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ConfigError(f"{name} must not be negative or infinite, got {getattr(self, name)}")
-        for name in ("flip", *_PHOTOMETRIC, "mosaic", "mixup"):
+        for name in ("flip", *_PHOTOMETRIC, "bonnet", "mosaic", "mixup"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"{name} is a probability, in [0, 1], got {getattr(self, name)}")
 
@@ -323,6 +326,8 @@ class TrainTransform:
         return dataclasses.replace(moved, image=image)
 
     def _warp(self, sample: Sample, rng: np.random.Generator) -> Sample:
+        if self.strength.bonnet and rng.random() < self.strength.bonnet:
+            sample = bonnet(sample, rng)
         return warp(sample, draw_affine(rng, self.strength), self.canvas, self.strength.mask_above)
 
     def _mosaic(
