@@ -27,6 +27,7 @@ from trilitenet.commands.evaluate import evaluate
 from trilitenet.commands.train import training_data
 from trilitenet.data.check_page import check_page
 from trilitenet.data.checking import CheckReport
+from trilitenet.data.contact_sheet import thumbnail
 from trilitenet.data.converting import ConversionOptions
 from trilitenet.data.description import DatasetDescription
 from trilitenet.data.prepared import PreparedDataset, open_dataset
@@ -360,6 +361,42 @@ def test_show_sheets_and_pages(published: Path, tmp_path: Path) -> None:
         show(published, tmp_path / "x.pdf")
 
 
+def test_each_picture_is_named(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for path in published.glob("*/val/val_0001.*"):
+        path.rename(path.with_stem("a<b>&"))
+    page = show(published, tmp_path / "page.html").output.read_text()
+    figures = re.findall(r'<figure[^>]*><img alt="([^"]+)"[^>]*><figcaption>([^<]+)</figcaption></figure>', page)
+    assert len(figures) == page.count("<img") == 18
+    assert all(alt == caption for alt, caption in figures)
+    assert {"a&lt;b&gt;&amp;, night", "train_0003, night, no area"} <= {caption for _, caption in figures}
+    splits: list[str] = []
+
+    def noted(*args: Any, split: str, **more: Any) -> Any:
+        splits.append(split)
+        return thumbnail(*args, split=split, **more)
+
+    monkeypatch.setattr(command, "thumbnail", noted)
+    show(published, tmp_path / "both.png", count=1)
+    show(published, tmp_path / "one.png", count=1, split="val")
+    check(published, html=tmp_path / "report.html", pictures=2, workers=1)
+    assert splits == ["train", "val", "", "train", "val"]
+
+
+def test_alternative_areas_are_tinted_less(published: Path, tmp_path: Path) -> None:
+    def pages() -> list[set[str]]:
+        page, report = tmp_path / "page.html", tmp_path / "report.html"
+        show(published, page, split="val")
+        check(published, html=report, workers=1)
+        return [set(re.findall(r"<img[^>]*>", path.read_text())) for path in (page, report)]
+
+    before = pages()
+    for path in published.glob("da_seg_annotations/*/*.png"):
+        mask = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+        cv2.imwrite(str(path), mask // 2)
+    page, report = (len(old - new) for old, new in zip(before, pages(), strict=True))
+    assert (page, report) == (5, 1)  # one of the six images has no area
+
+
 def test_a_sheet_keeps_its_colours(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "contact_sheet", lambda *_, **__: np.full((2, 3, 3), (250, 100, 0), np.uint8))
     show(published, tmp_path / "sheet.png", count=1)
@@ -419,6 +456,17 @@ def test_a_folder_that_is_not_there_is_told(call: Callable[[Path, Path], object]
     with pytest.raises(DataError, match=f"^{re.escape(str(missing))}: no such folder$"):
         call(missing, out)
     assert not out.exists()
+
+
+@pytest.mark.parametrize("words", ["data check", "data show", "data prepare", "evaluate tiny --data"])
+def test_an_address_in_place_of_the_folder_is_told_as_it_is(
+    words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    address = "https://localhost:1/prep"
+    assert main([*words.split(), address, *(["sheet.png"] if words == "data show" else [])]) == 1
+    assert capsys.readouterr().err == f"error: {address}: is an address; give a folder on this machine\n"
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("call", _TAKE_A_FOLDER[:6])

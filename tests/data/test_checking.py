@@ -90,10 +90,17 @@ def add_image(root: Path, split: str, name: str, image: np.ndarray) -> None:
         file.write(f"{name},{split},own-{split}-{name}\n")
 
 
-def brighter(root: Path) -> np.ndarray:
+def brighter(root: Path, by: int = 2, gamma: float = 1.0) -> np.ndarray:
     image = cv2.imread(str(root / "images/train/train_0003.jpg"))
     assert image is not None
-    return np.asarray(np.clip(image.astype(int) + 2, 0, 255), np.uint8)
+    return np.asarray(np.clip((image / 255) ** gamma * 255 + by, 0, 255), np.uint8)
+
+
+def put(root: Path, *names: str) -> None:
+    """Write files in folders that may be new; what is in them does not matter."""
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(b"x")
 
 
 def copy_image(root: Path, split: str, name: str) -> None:
@@ -136,6 +143,14 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object]]] = {
         "not-read",
         lambda root: cv2.imwrite(str(root / "da_seg_annotations/val/val_0003.bmp"), np.zeros((72, 128), np.uint8)),
     ),
+    "masks a folder too deep": (
+        "not-read",
+        lambda root: put(root, "da_seg_annotations/bdd_seg_gt/train/train_0003.png"),
+    ),
+    "a mask in no folder of a split": ("not-read", lambda root: put(root, "ll_seg_annotations/train_0004.png")),
+    "images a folder too deep": ("not-read", lambda root: put(root, "images/train/day1/0001.jpg")),
+    "an image in no folder of a split": ("not-read", lambda root: put(root, "images/0001.jpg")),
+    "image of another kind": ("not-read", lambda root: put(root, "images/train/0001.tif")),
     "no label at all": (
         "unlabelled",
         lambda root: unlink(*root.glob("*_annotations/train/train_0000.*")),
@@ -153,6 +168,14 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "copy in a split": ("duplicate", lambda root: copy_image(root, "train", "copy")),
     "copy across splits": ("leak-duplicate", lambda root: copy_image(root, "val", "copied")),
     "near copy across splits": ("leak-near-duplicate", lambda root: add_image(root, "val", "near", brighter(root))),
+    "brighter copy across splits": (
+        "leak-near-duplicate",
+        lambda root: add_image(root, "val", "brighter", brighter(root, by=15)),
+    ),
+    "copy of another gamma across splits": (
+        "leak-near-duplicate",
+        lambda root: add_image(root, "val", "gamma", brighter(root, by=0, gamma=0.85)),
+    ),
     "sequence across splits": (
         "leak-sequence",
         lambda root: (root / "index.csv").write_text((root / "index.csv").read_text().replace("sval1", "strain1")),
@@ -191,6 +214,87 @@ def test_a_file_that_is_not_read_is_named_with_the_cure(root: Path) -> None:
         "ll_seg_annotations/val/x.PNG is not read; rename it to .png",
         "ll_seg_annotations/val/y.bmp is not read; save it as .png",
     )
+
+
+def test_where_files_that_are_not_read_belong_is_told(root: Path) -> None:
+    put(
+        root,
+        "images/0001.jpg",
+        "images/100k/val/0001.jpg",
+        "images/train/day1/0001.jpg",
+        "images/train/day1/0002.JPG",
+        "images/train/day1/am/0001.tif",
+        "images/val/0001.HEIC",
+        "det_annotations/labels.json",
+        "det_annotations/new/more/0001.json",
+        "da_seg_annotations/bdd_seg_gt/val/val_0000.png",
+    )
+    findings = {finding.split: finding for finding in check_dataset(root).findings if finding.kind == "not-read"}
+    assert {split: finding.examples for split, finding in findings.items()} == {
+        "": (
+            "images/0001.jpg is not read; move it to images/SPLIT",
+            "det_annotations/labels.json is not read; move it to det_annotations/SPLIT",
+            "det_annotations/new/more is not read; move its files (1) to det_annotations/SPLIT",
+        ),
+        "train": (
+            "images/train/day1 is not read; move its files (2) to images/train",
+            "images/train/day1/am is not read; move its files (1) to images/train",
+        ),
+        "val": (
+            "images/100k/val is not read; move its files (1) to images/val",
+            "images/val/0001.HEIC is not read; save it as .jpg",
+            "da_seg_annotations/bdd_seg_gt/val is not read; move its files (1) to da_seg_annotations/val",
+        ),
+    }
+
+
+def test_other_files_beside_images_and_labels_are_no_fault(root: Path) -> None:
+    put(
+        root,
+        ".prepared/train/0001.png",
+        "README.md",
+        "human_road/train/train_0000.png",
+        "bdd_seg_gt/train/train_0000.png",  # left after a copy of it was made
+        "images/LICENSE.txt",
+        "images/.cache/train/0001.jpg",
+        "images/train/notes.txt",
+        "images/train/.thumbnails/0001.jpg",
+        "images/train/meta/._0001.jpg",
+        "images/train/meta/notes.txt",
+        "det_annotations/README.md",
+        "ll_seg_annotations/LICENSE",
+    )
+    shutil.copy(root / "da_seg_annotations/train/train_0000.png", root / "da_seg_annotations/bonnet.png")
+    (root / "dataset.yaml").write_text("ego_masks: {train_: da_seg_annotations/bonnet.png}\n")
+    assert check_dataset(root).findings == ()
+
+
+@pytest.mark.parametrize("made", [True, False])
+def test_folders_of_the_published_archives_are_named(root: Path, made: bool) -> None:
+    for folder, name in (("da_seg_annotations", "bdd_seg_gt"), ("ll_seg_annotations", "bdd_lane_gt")):
+        (root / folder).rename(root / name)
+        if made:
+            (root / folder).mkdir()
+    cure = "move its folders to" if made else "rename it to"
+    findings = {finding.kind: finding for finding in check_dataset(root).findings if finding.kind != "unlabelled"}
+    assert findings.keys() == {"not-read"}
+    assert findings["not-read"].examples == (
+        f"bdd_seg_gt is not read; {cure} da_seg_annotations",
+        f"bdd_lane_gt is not read; {cure} ll_seg_annotations",
+    )
+    (root / "dataset.yaml").write_text("tasks: [detection]\n")
+    assert kinds(check_dataset(root)) == {"unlabelled"}
+
+
+def test_folders_that_lead_back_are_looked_at_once(root: Path) -> None:
+    for name in ("one", "two"):
+        (root / f"images/train/{name}").symlink_to(root / "images")
+    findings = check_dataset(root).findings
+    assert [(finding.kind, finding.split, finding.count) for finding in findings] == [
+        ("not-read", "train", 2),
+        ("not-read", "val", 2),
+    ]
+    assert findings[1].examples[0] == "images/train/one/val is not read; move its files (10) to images/val"
 
 
 def test_an_ego_mask_of_a_name_that_no_system_has(root: Path) -> None:
@@ -348,6 +452,12 @@ def test_what_is_wrong_with_a_link_is_told(root: Path, target: str, reason: str)
     image.symlink_to(target)
     (finding,) = [finding for finding in check_dataset(root).findings if finding.kind == "image-unreadable"]
     assert finding.examples == (f"images/train/train_0004.jpg ({reason})",)
+
+
+def test_flat_pictures_of_other_brightness_are_no_copies(root: Path) -> None:
+    for split, level in (("train", 20), ("val", 90)):
+        add_image(root, split, f"flat_{split}", np.full((72, 128, 3), level, np.uint8))
+    assert check_dataset(root).findings == ()
 
 
 def test_copies_are_found_among_many_pictures_of_one_hash() -> None:

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import errno
 import logging
 import os
 import shutil
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,9 +18,10 @@ import pytest
 import torch
 
 from tests.data.published import write_annotation, write_published
+from tests.data.serving import serving
 from trilitenet.data.identity import identify, tell_apart
 from trilitenet.data.loader import build_loader
-from trilitenet.data.prepared import PreparedDataset, open_dataset, prepare
+from trilitenet.data.prepared import PreparedDataset, default_cache, open_dataset, prepare
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.sample import VALID
 from trilitenet.data.transforms import TrainTransform
@@ -305,6 +308,71 @@ def test_copies_of_remote_shards_are_of_one_state(root: Path, tmp_path: Path, ca
     shutil.rmtree(tmp_path / "out")  # as if the network were down
     np.testing.assert_array_equal(PreparedDataset(address, "val", cache=copies)[0].image, anew[0].image)
     assert "going on with the copies" in caplog.text
+
+
+def test_a_data_set_at_an_address_is_opened_like_a_folder(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("trilitenet.data.prepared._PAUSES", (0.0,))
+    prepare(root, tmp_path / "out", canvas=CANVAS, shard_size=4)
+    here = PreparedDataset(tmp_path / "out", "train")
+    with serving(tmp_path) as site:
+        address = f"{site.address}/out"
+        there = open_dataset(address, "train", canvas=CANVAS)
+        assert isinstance(there, PreparedDataset)
+        assert identify(there) == identify(here)
+        assert "train-000000.tar" not in site.asked
+        site.fails = {"train-000001.tar": 1}  # it breaks off, and comes whole when it is asked for again
+        told: list[tuple[int, int]] = []
+        there.copy(lambda *counts: told.append(counts))
+        assert told == [(1, 3), (2, 3), (3, 3)]
+        assert site.asked.count("train-000001.tar") == 2
+        np.testing.assert_array_equal(there[5].image, here[5].image)
+        count = len(site.asked)
+        again = open_dataset(Path(f"{address}/"), "train")  # a path eats a slash
+        assert isinstance(again, PreparedDataset)
+        again.copy()
+        assert open_dataset(f"{address}/", "train").names == here.names
+        assert len(site.asked) == count + 2  # for prepared.json
+        assert default_cache() == tmp_path / "home/trilitenet"
+        assert len(list(tmp_path.glob("home/trilitenet/*.json"))) == 1
+        with pytest.raises(DataError, match=rf"^{address}: prepared with --mask-above 1, 64 is wanted"):
+            open_dataset(address, "train", canvas=CANVAS, mask_above=64)
+        site.fails = {"train-000000.tar": 2}
+        other = open_dataset(address, "train", cache=tmp_path / "cache")
+        with pytest.raises(DataError, match=r"/train-000000\.tar: cannot be fetched \(999990 bytes are missing at"):
+            other[0]
+        with pytest.raises(DataError, match=r"/no/prepared\.json: cannot be fetched \(HTTP Error 404: .*\); give the"):
+            open_dataset(f"{site.address}/no", "train")
+    there.copy()
+    with pytest.raises(DataError, match=rf"^{address}/prepared\.json: cannot be fetched \(.*refused\)$"):
+        open_dataset(address, "train", cache=tmp_path / "another")
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match=r"file.*: cannot be written"):
+        open_dataset(address, "train", cache=tmp_path / "file" / "cache")
+
+
+def test_a_shard_is_copied_once_whoever_wants_it(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("fcntl")
+    prepare(root, tmp_path / "out", canvas=CANVAS)
+    with serving(tmp_path / "out") as site:
+        dataset = PreparedDataset(site.address, "val", cache=tmp_path / "copies")
+        both = threading.Barrier(2)
+        plain = Path.is_file
+
+        def is_file(path: Path) -> bool:
+            found = plain(path)
+            if path.suffix == ".tar" and not both.broken and not found:
+                with contextlib.suppress(threading.BrokenBarrierError):
+                    both.wait(1)  # both see that it is not there
+            return found
+
+        monkeypatch.setattr(Path, "is_file", is_file)
+        with concurrent.futures.ThreadPoolExecutor(2) as pool:
+            first, second = pool.map(dataset.__getitem__, (0, 0))
+        np.testing.assert_array_equal(first.image, second.image)
+        assert site.asked.count("val-000000.tar") == 1
 
 
 def test_other_pixels_make_another_data_set(root: Path, tmp_path: Path) -> None:

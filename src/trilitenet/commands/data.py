@@ -18,7 +18,7 @@ from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, one_f
 from trilitenet.commands.progress import show_progress
 from trilitenet.data.check_page import check_page, picture_page
 from trilitenet.data.checking import KINDS, CheckReport, check_dataset, detect_layout
-from trilitenet.data.contact_sheet import contact_sheet, draw_sample, pick
+from trilitenet.data.contact_sheet import alternative_area, caption, contact_sheet, draw_sample, pick, thumbnail
 from trilitenet.data.converting import ConversionOptions, ConversionReport
 from trilitenet.data.converting import convert as run_conversion
 from trilitenet.data.description import DatasetDescription, folder_name
@@ -26,7 +26,6 @@ from trilitenet.data.prepared import CACHE_FOLDER, is_prepared
 from trilitenet.data.prepared import prepare as run_preparation
 from trilitenet.data.reading import DrivingDataset, check_root, split_folders
 from trilitenet.data.records import RecordSource
-from trilitenet.data.sample import Sample
 from trilitenet.engine.report import render
 from trilitenet.errors import ConfigError, DataError, OutputError, did_you_mean, few, write_file
 from trilitenet.formats.readers.bdd100k import read_bdd100k
@@ -347,9 +346,12 @@ def show(
         }
         write_file(output, picture_page(f"{folder_name(root)} {' '.join(where)}".strip(), pictures))
     else:
-        samples = [dataset[index] for dataset, indices in groups.values() for index in indices]
-        names = next(iter(groups.values()))[0].class_names
-        sheet = contact_sheet(samples, names, columns=columns, size=(width * 9 // 16, width))
+        thumbnails = [
+            _thumbnail(dataset, index, (width * 9 // 16, width), split=name if len(groups) > 1 else "")
+            for name, (dataset, indices) in groups.items()
+            for index in indices
+        ]
+        sheet = contact_sheet(thumbnails, columns=columns)
         done, data = cv2.imencode(output.suffix, cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
         if not done:
             raise OutputError(f"{output}: a sheet of {sheet.shape[1]}x{sheet.shape[0]} pixels cannot be encoded")
@@ -510,24 +512,29 @@ def _splits(root: Path) -> list[str]:
 
 def _some_pictures(report: CheckReport, count: int) -> Any:
     """Return a contact sheet of readable images, from all splits alike."""
-    samples: list[Sample] = []
-    names: tuple[str, ...] = ("vehicle",)
+    thumbnails = []
     for split in report.images if count > 0 else ():
         with contextlib.suppress(DataError):  # of a split that cannot be read, as the report tells
             dataset = DrivingDataset(report.root, split)
-            names = dataset.class_names
             for index in pick(dataset, {}, max(1, count // len(report.images))):
                 with contextlib.suppress(DataError):
-                    samples.append(dataset[index])
-    return contact_sheet(samples, names) if samples else None
+                    thumbnails.append(_thumbnail(dataset, index, split=split if len(report.images) > 1 else ""))
+    return contact_sheet(thumbnails) if thumbnails else None
 
 
-def _all_fitted(dataset: DrivingDataset, indices: Iterable[int], width: int) -> Iterator[Any]:
-    """Yield the drawn images one by one: a page needs but one of them at a time."""
+def _thumbnail(dataset: DrivingDataset, index: int, size: tuple[int, int] = (180, 320), *, split: str) -> Any:
+    return thumbnail(
+        dataset[index], dataset.class_names, size, split=split, alternative=alternative_area(dataset, index)
+    )
+
+
+def _all_fitted(dataset: DrivingDataset, indices: Iterable[int], width: int) -> Iterator[tuple[str, Any]]:
+    """Yield captions and drawn images one by one: a page needs but one of them at a time."""
     for index in indices:
         sample = dataset[index]
         box = Letterbox.fit(sample.size, long_side=width, stride=1)
-        yield box.image(draw_sample(sample, dataset.class_names))
+        drawn = draw_sample(sample, dataset.class_names, alternative_area(dataset, index))
+        yield caption(sample), box.image(drawn)
 
 
 def _workers(workers: int) -> int:

@@ -25,7 +25,8 @@ h1 { font-size: 1.5rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2rem 0 .5r
 table { border-collapse: collapse; } th, td { padding: .25rem .8rem .25rem 0; text-align: left; vertical-align: top;
 border-bottom: 1px solid var(--line); } td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
 code { font-size: .85em; } .bad { color: var(--bad); font-weight: 600; } .good { color: var(--good); font-weight: 600; }
-.plots { display: flex; flex-wrap: wrap; gap: 1.5rem; } figure { margin: 0; } figcaption { font-size: .85rem; }
+.plots { display: flex; flex-wrap: wrap; gap: 1.5rem; } figure { margin: 0; } figcaption { font-size: .85rem;
+overflow-wrap: anywhere; }
 img, svg { display: block; max-width: 100%; height: auto; } .scroll { overflow-x: auto; }
 svg text { font: 11px system-ui, sans-serif; fill: currentColor; }
 """
@@ -77,21 +78,23 @@ def check_page(report: CheckReport, sheet: NDArray[np.uint8] | None = None) -> s
     ]
     if sheet is not None:
         parts = [sheet[top : top + _MOST_ROWS] for top in range(0, len(sheet), _MOST_ROWS)]
-        body += ["<h2>Some of it, with its labels</h2>", *map(_image, parts)]
+        body += ["<h2>Some of it, with its labels</h2>", *(_image(part, "images with their labels") for part in parts)]
     return _page(f"Check of {folder_name(report.root)}", body)
 
 
-def picture_page(title: str, groups: Mapping[str, Iterable[NDArray[np.uint8]]]) -> str:
+def picture_page(title: str, groups: Mapping[str, Iterable[tuple[str, NDArray[np.uint8]]]]) -> str:
     """Return a page of pictures.
 
     Args:
         title: Of the page.
-        groups: Heading -> (H, W, 3) uint8 RGB pictures.
+        groups: Heading -> captions and (H, W, 3) uint8 RGB pictures.
     """
     body = [f"<h1>{_text(title)}</h1>"]
     for heading, pictures in groups.items():
         body.append(f"<h2>{_text(heading)}</h2><div class='plots'>")
-        body += [_image(picture) for picture in pictures]
+        body += [
+            _figure(_image(picture, caption), _text(caption), width=picture.shape[1]) for caption, picture in pictures
+        ]
         body.append("</div>")
     return _page(title, body)
 
@@ -135,13 +138,16 @@ def _by_row(columns: Mapping[str, Mapping[str, int]]) -> list[list[object]]:
     return [[name, *(column.get(name, 0) for column in columns.values())] for name in names]
 
 
-def _figure(content: str, caption: str) -> str:
-    return f"<figure>{content}<figcaption>{caption}</figcaption></figure>"
+def _figure(content: str, caption: str, width: int | None = None) -> str:
+    """Return a drawing above its caption, both of at most so many pixels."""
+    style = "" if width is None else f' style="max-width: {width}px"'
+    return f"<figure{style}>{content}<figcaption>{caption}</figcaption></figure>"
 
 
-def _image(picture: NDArray[np.uint8]) -> str:
+def _image(picture: NDArray[np.uint8], text: str) -> str:
+    """Return a picture; ``text`` stands for it where it is not seen."""
     data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
-    return f'<img alt="" src="data:image/jpeg;base64,{base64.b64encode(data).decode()}">'
+    return f'<img alt="{_text(text)}" src="data:image/jpeg;base64,{base64.b64encode(data).decode()}">'
 
 
 def _bars(series: Mapping[str, Mapping[str, int]]) -> str:

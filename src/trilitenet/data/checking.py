@@ -13,6 +13,7 @@ import io
 import itertools
 import math
 import mmap
+import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -26,6 +27,7 @@ from trilitenet.config import DEFAULT_ANCHORS, LONG_SIDE, parse_json
 from trilitenet.data.description import DatasetDescription, MaskMeaning, class_table, read_description
 from trilitenet.data.prepared import is_prepared
 from trilitenet.data.reading import (
+    IMAGE_ENDINGS,
     IMAGE_FOLDER,
     LABEL_FILES,
     check_root,
@@ -57,7 +59,7 @@ KINDS: Final[dict[str, str]] = {
     "category-unknown": "a category that is neither in a class nor one of BDD100K's",
     "no-class": "there are boxes, and none is of a class",
     "orphan": "an annotation or a mask without its image",
-    "not-read": "a file among the annotations or masks whose ending is not the one that is read",
+    "not-read": "an image, annotation or mask in a folder, or of an ending, that is not read",
     "unlabelled": "an image without any label",
     "name-in-two-splits": "the same name in two splits",
     "name-twice": "images that differ in their ending alone, and would have the same labels",
@@ -80,10 +82,23 @@ _KNOWN_CATEGORIES: Final = frozenset({
 _PLAIN_VALUES: Final = frozenset({0, 127, 255})
 """Values of masks without a description: background, alternative area, foreground."""
 
+_PICTURES: Final = (
+    *IMAGE_ENDINGS, ".tif", ".tiff", ".jfif", ".jpe", ".jp2", ".heic", ".heif", ".avif", ".gif", ".ppm", ".pgm",
+)  # fmt: skip
+"""Endings of images and masks, read or not."""
+_SPLITS: Final = ("train", "val", "test")
+"""Folders that hold a split wherever they are."""
+_ARCHIVES: Final = {"drivable": "bdd_seg_gt", "lane": "bdd_lane_gt"}
+"""What the archives of the published masks call a task's folder."""
+
 _HASH_DISTANCE: Final = 4
 """Of 64 bits: perceptual hashes this near are compared closer."""
 _THUMB_DISTANCE: Final = 5.0
 """Mean difference of 16 x 16 grey thumbnails under which two pictures are nearly the same, of 255."""
+_FLAT: Final = 2.0
+"""Standard deviation of a thumbnail under which its picture is flat."""
+_GAINS: Final = (0.6, 1.6)
+"""Least and greatest factor between the contrasts of two pictures that are nearly the same."""
 _SLACK: Final = 1.0
 """A box may reach out of the image by this many pixels: annotators round."""
 _MIN_ANCHOR_RECALL: Final = 0.98
@@ -271,11 +286,12 @@ def check_dataset(
         index = []
     _find_classes(job, facts, collector)
     _find_orphans(job, names, collector)
+    _find_misplaced(job, facts, collector)
     _find_names(facts, collector)
     _find_duplicates(facts, collector)
     _find_near_duplicates(facts, collector)
     _find_sequences(index, facts, collector)
-    for name in filter(None, {description.ego_mask, *description.ego_masks.values()}):
+    for name in _ego_masks(description):
         if not _is_mask(root / name):
             collector.add("ego-mask", "", name)
     for split in dict.fromkeys((*description.splits, *names)):
@@ -302,6 +318,10 @@ def check_dataset(
         box_sizes=tuple((float(w), float(h)) for w, h in box_sizes[chosen]),
         findings=collector.findings(),
     )
+
+
+def _ego_masks(description: DatasetDescription) -> list[str]:
+    return sorted(filter(None, {description.ego_mask, *description.ego_masks.values()}))
 
 
 def _is_mask(path: Path) -> bool:
@@ -500,10 +520,7 @@ def _find_classes(job: _Job, facts: dict[str, list[_Facts]], collector: _Collect
 def _find_orphans(job: _Job, names: dict[str, list[str]], collector: _Collector) -> None:
     """Look for label files that belong to no image, or that are passed over for their ending."""
     root = job.root
-    for task, (folder, ending) in LABEL_FILES.items():
-        read = task == "detection" or task in job.description.tasks  # annotations hold the attributes, too
-        if not (read and (root / folder).is_dir()):
-            continue
+    for folder, ending in _label_folders(job.description):
         for split in (path.name for path in split_folders(root, folder)):
             images = {Path(name).stem for name in names.get(split, ())}
             for path in sorted((root / folder / split).iterdir()):
@@ -516,6 +533,49 @@ def _find_orphans(job: _Job, names: dict[str, list[str]], collector: _Collector)
                 elif path.is_file():
                     cure = "rename it to" if path.suffix.lower() == ending else "save it as"
                     collector.add("not-read", split, f"{where} is not read; {cure} {ending}")
+
+
+def _label_folders(description: DatasetDescription) -> list[tuple[str, str]]:
+    """Return folder and file ending of the labels that are read; annotations hold the attributes, too."""
+    return [files for task, files in LABEL_FILES.items() if task == "detection" or task in description.tasks]
+
+
+def _find_misplaced(job: _Job, facts: dict[str, list[_Facts]], collector: _Collector) -> None:
+    """Look for images and labels in folders that are not read, and for images of endings that are not."""
+    root, about = job.root, job.description
+    splits = {*_SPLITS, *about.splits, *facts}
+    ego = {root / name for name in _ego_masks(about)}
+    for top, ending in ((IMAGE_FOLDER, ".jpg"), *_label_folders(about)):
+        for folder, found in _files_below(root / top, _PICTURES if ending in _PICTURES else (ending,)):
+            names = [name for name in found if folder / name not in ego]
+            where = folder.relative_to(root).as_posix()
+            inside = folder.relative_to(root / top).parts
+            split = next((part for part in reversed(inside) if part in splits), "")
+            target = f"{top}/{split or 'SPLIT'}"
+            if not inside:
+                for name in names:
+                    collector.add("not-read", "", f"{where}/{name} is not read; move it to {target}")
+            elif len(inside) > 1 and names:
+                collector.add("not-read", split, f"{where} is not read; move its files ({len(names)}) to {target}")
+            elif top == IMAGE_FOLDER and len(inside) == 1:
+                for name in names:
+                    if not is_image_file(name):
+                        collector.add("not-read", split, f"{where}/{name} is not read; save it as {ending}")
+    for task, name in _ARCHIVES.items():
+        labelled = any(task in fact.labelled for items in facts.values() for fact in items)
+        if task in about.tasks and not labelled and (root / name).is_dir():
+            own, _ = LABEL_FILES[task]
+            cure = "move its folders to" if (root / own).exists() else "rename it to"
+            collector.add("not-read", "", f"{name} is not read; {cure} {own}")
+
+
+def _files_below(top: Path, endings: tuple[str, ...]) -> Iterator[tuple[Path, list[str]]]:
+    """Yield a folder and each below it, with the names in it of these endings; hidden ones are passed over."""
+    for where, folders, files in os.walk(top, followlinks=True):
+        folder = Path(where)
+        deep = len(folder.relative_to(top).parts) > 1  # where a link may lead back
+        folders[:] = sorted(f for f in folders if not f.startswith(".") and not (deep and (folder / f).is_symlink()))
+        yield folder, sorted(name for name in files if not name.startswith(".") and name.lower().endswith(endings))
 
 
 def _find_names(facts: dict[str, list[_Facts]], collector: _Collector) -> None:
@@ -555,14 +615,29 @@ def _find_near_duplicates(facts: dict[str, list[_Facts]], collector: _Collector)
         thumbs = np.stack([np.frombuffer(fact.thumb, np.uint8) for fact in readable[large]])
         for fact in readable[small]:
             near = np.flatnonzero(_popcount(hashes ^ np.uint64(fact.hash)) <= _HASH_DISTANCE)
-            thumb = np.frombuffer(fact.thumb, np.uint8).astype(np.int16)
-            gaps = np.abs(thumbs[near] - thumb).mean(axis=1)
+            thumb = np.frombuffer(fact.thumb, np.uint8).astype(np.float32)
+            gaps = _gaps(thumb, thumbs[near].astype(np.float32))
             # Dark or even pictures are alike in few grey levels: they must be the nearer, the flatter they are.
             for index in near[gaps < min(_THUMB_DISTANCE, 0.1 * float(thumb.std()) + 0.2)]:
                 other = readable[large][index]
                 if other.digest != fact.digest:
                     collector.add("leak-near-duplicate", f"{one}, {two}", f"{small}/{fact.name} ~ {large}/{other.name}")
                     break
+
+
+def _gaps(thumb: NDArray[np.float32], others: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the mean difference of a thumbnail (P,) to each of others (N, P): as they are, or evened if that is less.
+
+    Evened are brightness and contrast. A picture that is flat has nothing but these to tell it by.
+    """
+    gaps = np.abs(others - thumb).mean(axis=1)
+    if thumb.std() >= _FLAT:
+        thumb = thumb - thumb.mean()
+        others = others - others.mean(axis=1, keepdims=True)
+        gains = others @ thumb / np.maximum((others**2).sum(axis=1), 1.0)
+        evened = others * np.clip(gains, *_GAINS)[:, None]
+        gaps = np.minimum(gaps, np.abs(evened - thumb).mean(axis=1))
+    return np.asarray(gaps)
 
 
 def _popcount(values: NDArray[np.uint64]) -> NDArray[np.uint8]:

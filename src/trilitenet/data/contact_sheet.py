@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Final
 
@@ -9,17 +10,23 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.data.reading import DrivingDataset
+from trilitenet.data.reading import DrivingDataset, decode_grey
 from trilitenet.data.sample import Sample
-from trilitenet.processing.drawing import draw, line_thickness
+from trilitenet.processing.drawing import DRIVABLE_COLOUR, draw, line_thickness
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.structures import Boxes, Perception
 
-__all__ = ["as_perception", "contact_sheet", "draw_sample", "pick", "thumbnail"]
+__all__ = ["alternative_area", "as_perception", "caption", "contact_sheet", "draw_sample", "pick", "thumbnail"]
 
 _IGNORED_COLOUR: Final = (150, 150, 150)
 _INVALID_COLOUR: Final = (213, 94, 0)
 _TEXT_ROWS: Final = 18
+_LONGEST: Final = 30
+"""Characters of a name that a sheet has room for."""
+_ALTERNATIVE: Final = {127: "alternative"}
+"""Values of drivable masks of a data set that does not name them, where they are not plainly drivable."""
+_FAINT: Final = 0.15
+"""Opacity of alternative areas, where direct ones have 0.42."""
 
 
 def as_perception(sample: Sample, class_names: Sequence[str]) -> Perception:
@@ -37,7 +44,29 @@ def as_perception(sample: Sample, class_names: Sequence[str]) -> Perception:
     )
 
 
-def draw_sample(sample: Sample, class_names: Sequence[str]) -> NDArray[np.uint8]:
+def alternative_area(dataset: DrivingDataset, index: int) -> NDArray[np.bool_] | None:
+    """Return where an image's drivable mask says that the area is an alternative one, which a sample does not tell.
+
+    Args:
+        dataset: The split.
+        index: Of an image that can be read.
+
+    Returns:
+        (H, W) bool; None where there is no such area.
+    """
+    names = dataset.description.drivable.values or _ALTERNATIVE
+    values = [value for value, name in names.items() if name == "alternative"]
+    path = dataset.label_path("drivable", dataset.names[index])
+    if not (values and path.is_file()):
+        return None
+    grey = decode_grey(np.fromfile(path, np.uint8), str(path))
+    area = np.isin(grey, values) if grey is not None else np.zeros(0, np.bool_)
+    return area if area.any() else None
+
+
+def draw_sample(
+    sample: Sample, class_names: Sequence[str], alternative: NDArray[np.bool_] | None = None
+) -> NDArray[np.uint8]:
     """Return the image with its labels: areas and markings blended, objects boxed, ignored regions in grey.
 
     Pixels that are ignored by every task (the own car) are hatched, those that one mask ignores the other way. What is
@@ -46,11 +75,18 @@ def draw_sample(sample: Sample, class_names: Sequence[str]) -> NDArray[np.uint8]
     Args:
         sample: Of any size.
         class_names: Names that ``sample.class_id`` indexes.
+        alternative: (H, W) bool where drivable areas are alternative ones, which are tinted less; None for nowhere.
 
     Returns:
         (H, W, 3) uint8 RGB.
     """
-    canvas = draw(as_perception(sample, class_names), sample.image, hide=("labels",))
+    image = sample.image
+    if alternative is not None and sample.drivable is not None:
+        faint = alternative & (sample.drivable > 0)
+        image = image.copy()
+        image[faint] = np.rint((1 - _FAINT) * image[faint] + _FAINT * np.array(DRIVABLE_COLOUR)).astype(np.uint8)
+        sample = dataclasses.replace(sample, drivable=np.where(faint, np.uint8(0), sample.drivable))
+    canvas = draw(as_perception(sample, class_names), image, hide=("labels",))
     for valid, way in ((sample.valid, 1), (sample.drivable_valid, -1), (sample.lane_valid, -1)):
         if valid is not None:
             rows, columns = np.indices(sample.size)
@@ -60,33 +96,52 @@ def draw_sample(sample: Sample, class_names: Sequence[str]) -> NDArray[np.uint8]
     return canvas
 
 
-def thumbnail(sample: Sample, class_names: Sequence[str], size: tuple[int, int] = (180, 320)) -> NDArray[np.uint8]:
-    """Return a drawn sample made to fit ``size`` (height, width), with its name and missing tasks below.
+def caption(sample: Sample) -> str:
+    """Return a sample's name, condition and missing tasks."""
+    return ", ".join(filter(None, [sample.name, *_remarks(sample)]))
+
+
+def thumbnail(
+    sample: Sample,
+    class_names: Sequence[str],
+    size: tuple[int, int] = (180, 320),
+    *,
+    split: str = "",
+    alternative: NDArray[np.bool_] | None = None,
+) -> NDArray[np.uint8]:
+    """Return a drawn sample made to fit ``size`` (height, width), with its name, condition and missing tasks below.
+
+    Args:
+        sample: Of any size.
+        class_names: Names that ``sample.class_id`` indexes.
+        size: (height, width) in pixels.
+        split: To name it too.
+        alternative: See `draw_sample`.
 
     Returns:
         (height + 18, width, 3) uint8 RGB.
     """
-    small = Letterbox.fit(sample.size, canvas=size).image(draw_sample(sample, class_names))
+    small = Letterbox.fit(sample.size, canvas=size).image(draw_sample(sample, class_names, alternative))
     label = np.full((_TEXT_ROWS, size[1], 3), 255, np.uint8)
-    cv2.putText(label, _caption(sample), (3, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (0, 0, 0), 1, cv2.LINE_AA)
+    name = sample.name
+    if len(name) > _LONGEST:  # what tells it from others is as a rule at its end
+        name = f"{name[: _LONGEST // 2 - 2]}..{name[-_LONGEST // 2 :]}"
+    text = "  ".join(filter(None, [f"{split}/{name}" if split else name, *_remarks(sample)]))
+    cv2.putText(label, text, (3, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (0, 0, 0), 1, cv2.LINE_AA)
     return np.concatenate([small, label])
 
 
-def contact_sheet(
-    samples: Sequence[Sample], class_names: Sequence[str], *, columns: int = 4, size: tuple[int, int] = (180, 320)
-) -> NDArray[np.uint8]:
-    """Return one picture of many samples.
+def contact_sheet(thumbnails: Sequence[NDArray[np.uint8]], *, columns: int = 4) -> NDArray[np.uint8]:
+    """Return one picture of many.
 
     Args:
-        samples: In reading order; at least one.
-        class_names: Names that class ids index.
+        thumbnails: In reading order, of one size; at least one.
         columns: Pictures a row.
-        size: (height, width) of each.
 
     Returns:
         (H, W, 3) uint8 RGB.
     """
-    tiles = [thumbnail(sample, class_names, size) for sample in samples]
+    tiles = list(thumbnails)
     columns = min(columns, len(tiles))
     tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
     rows = [np.concatenate(tiles[first : first + columns], axis=1) for first in range(0, len(tiles), columns)]
@@ -113,9 +168,9 @@ def pick(dataset: DrivingDataset, where: Mapping[str, str], count: int, *, seed:
     return found[start:]
 
 
-def _caption(sample: Sample) -> str:
+def _remarks(sample: Sample) -> list[str]:
+    """Return a sample's condition and what is not labelled, each empty where there is nothing to say."""
     tasks = (("boxes", sample.boxes), ("area", sample.drivable), ("lane", sample.lane))
     missing = [name for name, label in tasks if label is None]
     condition = sample.attributes.get("condition") or sample.attributes.get("timeofday", "")
-    name = sample.name if len(sample.name) <= 30 else f"{sample.name[:28]}.."
-    return "  ".join(filter(None, [name, condition, f"no {', '.join(missing)}" if missing else ""]))
+    return [condition, f"no {', '.join(missing)}" if missing else ""]

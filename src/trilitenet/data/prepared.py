@@ -26,6 +26,8 @@ import multiprocessing
 import os
 import re
 import tarfile
+import time
+import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from multiprocessing.sharedctypes import Synchronized
@@ -45,6 +47,7 @@ from trilitenet.data.reading import (
     PREPARED_FILE,
     DrivingDataset,
     SampleSource,
+    as_address,
     check_root,
     decode_image,
     is_image_file,
@@ -65,7 +68,12 @@ from trilitenet.errors import (
 from trilitenet.processing.cores import ProcessPool
 from trilitenet.processing.letterbox import Letterbox
 
-__all__ = ["PreparedDataset", "is_prepared", "open_dataset", "prepare", "shrink"]
+try:
+    import fcntl
+except ModuleNotFoundError:  # on Windows
+    fcntl = None  # type: ignore[assignment]
+
+__all__ = ["PreparedDataset", "default_cache", "is_prepared", "open_dataset", "prepare", "shrink"]
 
 _LOGGER: Final = logging.getLogger(__name__)
 
@@ -79,7 +87,11 @@ _LAYOUT: Final = 3
 _BY_SPLIT: Final = ("splits", "shards", "counts", "indexes")
 """What ``prepared.json`` says of a split: hash of what it was made from, shards, count of images, hash of indexes."""
 _PATIENCE: Final = 10.0
-"""Seconds in which an address must answer."""
+"""Seconds in which an address must answer, and go on."""
+_PAUSES: Final = (1.0, 4.0, 16.0, 30.0)
+"""Seconds after which a file that did not come is asked for again."""
+_BUSY: Final = (408, 429)
+"""What a web server that may answer later says, beside its own faults (500 and above)."""
 
 _ENTRY: Final = frozenset({"name", "size", "boxes", "class_id", "ignored", "attributes", "parts"})
 """What every line of an index holds."""
@@ -214,34 +226,41 @@ def open_dataset(
     classes: Mapping[str, Sequence[str]] | None = None,
     tasks: Sequence[Task] | None = None,
     mask_above: int | None = None,
+    cache: str | Path | None = None,
 ) -> DrivingDataset | PreparedDataset:
     """Open a split of a data set, whatever its layout.
 
-    A prepared data set is read as such. For one in the published layout, the prepared copy in its ``.prepared`` is used
-    if it is for this canvas and these classes and the data set has not changed since.
+    A prepared data set is read as such, also one at an address. For one in the published layout, the prepared copy in
+    its ``.prepared`` is used if it is for this canvas and these classes and the data set has not changed since.
 
     Args:
-        root: The data set.
+        root: The data set, or the address (``https://...``) of a prepared one.
         split: The split.
         canvas: (height, width) that the samples will be brought to; None reads the images as they are.
         class_names: Detection classes; those of the data set if left out.
         classes: Class name -> categories; with it, no prepared copy is used.
         tasks: Read the labels of these alone.
         mask_above: A resized mask pixel above this, of 255, shall be foreground; None takes any prepared copy.
+        cache: Where copies of what is at an address go; `default_cache` if left out.
 
     Raises:
-        DataError: If there is no such split, or a prepared data set has masks made otherwise.
+        DataError: If there is no such split, a prepared data set has masks made otherwise, or there is none at an
+            address.
     """
+    address = as_address(root)
     root = Path(root)
-    if is_prepared(root):
-        prepared = PreparedDataset(root, split, class_names=class_names, tasks=tasks)
+    if address is not None or is_prepared(root):
+        place = address or root
+        prepared = PreparedDataset(
+            place, split, class_names=class_names, tasks=tasks, cache=default_cache() if cache is None else cache
+        )
         if mask_above not in (None, prepared.mask_above):
             raise DataError(
-                f"{root}: prepared with --mask-above {prepared.mask_above}, {mask_above} is wanted; prepare it again, "
+                f"{place}: prepared with --mask-above {prepared.mask_above}, {mask_above} is wanted; prepare it again, "
                 f"or set augmentation.mask_above to {prepared.mask_above}"
             )
         if canvas is not None and prepared.canvas != canvas:
-            _LOGGER.warning("%s: prepared for %s, used at %s", root, prepared.canvas, canvas)
+            _LOGGER.warning("%s: prepared for %s, used at %s", place, prepared.canvas, canvas)
         return prepared
     cache = root / CACHE_FOLDER
     if canvas is not None and classes is None and is_prepared(cache):
@@ -261,12 +280,20 @@ def open_dataset(
     return DrivingDataset(root, split, class_names=class_names, classes=classes, tasks=tasks)
 
 
+def default_cache() -> Path | None:
+    """Return where copies of what is at an address go unless it is said; None for a user without a home."""
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "trilitenet")
+    except RuntimeError:
+        return None
+
+
 class PreparedDataset:
     """One split of a prepared data set. The images of its samples may be read-only.
 
     Args:
         root: The folder with ``prepared.json``, or the address of one (``https://...``), whose shards are then copied
-            to ``cache`` when they are first used.
+            to ``cache`` when they are first used, or by `copy`.
         split: The split.
         class_names: Must be those it was prepared with, if given.
         tasks: Read the labels of these alone.
@@ -322,6 +349,17 @@ class PreparedDataset:
     def names(self) -> list[str]:
         """The images' names."""
         return [self._entry(index)["name"] for index in range(len(self))]
+
+    def copy(self, progress: Callable[[int, int], None] | None = None) -> None:
+        """Copy all shards from an address, but those that are copied already; ``progress`` is called with their counts.
+
+        Raises:
+            DataError: If that fails.
+        """
+        for number, shard in enumerate(self._shards if self._place.cache else ()):
+            self._place.file(shard, self._digests[number])
+            if progress:
+                progress(number + 1, len(self._shards))
 
     def __len__(self) -> int:
         return len(self._lines)
@@ -418,12 +456,31 @@ class _Place:
             return path
         path = self.cache / name
         if not path.is_file():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with replacing(path) as part:
-                found = _fetch(self.root, name, part)
-                if digest not in (None, found):
-                    raise DataError(f"{self.root}/{name}: was prepared anew since it was opened; begin again")
+            with writing(path):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with _taking_turns(path):
+                    if not path.is_file():  # another process has not copied it meanwhile
+                        self._fetch(name, digest, path)
         return path
+
+    def _fetch(self, name: str, digest: str | None, path: Path) -> None:
+        with replacing(path) as part:
+            found = _fetch(self.root, name, part)
+            if digest not in (None, found):
+                raise DataError(f"{self.root}/{name}: was prepared anew since it was opened; begin again")
+
+
+@contextlib.contextmanager
+def _taking_turns(path: Path) -> Iterator[None]:
+    """Inside, no other process copies a file, which all would, as each reads from every shard.
+
+    Where the system or the file system knows no locks, they do.
+    """
+    with path.with_name(f".{path.name}.lock").open("ab") as file:
+        if fcntl is not None:
+            with contextlib.suppress(OSError):
+                fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def _open_place(root: str, split: str, cache: Path | None) -> tuple[_Place, dict[str, Any]]:
@@ -432,15 +489,18 @@ def _open_place(root: str, split: str, cache: Path | None) -> tuple[_Place, dict
     What is remote is asked for ``prepared.json`` anew each time, so that no copies of another state, or of another data
     set, are read; where it cannot be asked, the copies of its last state are.
     """
-    if "://" not in root:
+    address = as_address(root)
+    if address is None:
         place = _Place(root, None)
         return place, _read_state(place.file(PREPARED_FILE))
+    root = address.rstrip("/")
     if cache is None:
         raise DataError(f"{root}: give `cache`, a folder for copies of remote shards")
     path = cache / f"{hashlib.sha256(root.encode()).hexdigest()[:16]}.json"
-    cache.mkdir(parents=True, exist_ok=True)
+    with writing(cache):
+        cache.mkdir(parents=True, exist_ok=True)
     try:
-        with replacing(path) as part:
+        with writing(cache), replacing(path) as part:
             _fetch(root, PREPARED_FILE, part)
             state = _read_state(part, f"{root}/{PREPARED_FILE}", "prepare the data set again")
     except (DataError, MissingExtraError) as error:
@@ -456,25 +516,47 @@ def _open_place(root: str, split: str, cache: Path | None) -> tuple[_Place, dict
 def _fetch(root: str, name: str, path: Path) -> str:
     """Copy a remote file, and return its SHA-256.
 
+    ``prepared.json`` is asked for once; the others by HTTP again after each of `_PAUSES`, until they come whole.
+
     Raises:
         DataError: If that fails.
     """
-    url, digest = f"{root.rstrip('/')}/{name}", hashlib.sha256()
-    try:
-        with _remote(url, quick=name == PREPARED_FILE) as source, path.open("wb") as target:
-            while data := source.read(1 << 20):
-                target.write(data)
-                digest.update(data)
-    except (OSError, ValueError, http.client.HTTPException) as error:
-        raise DataError(f"{url}: cannot be fetched ({error})") from error
-    return digest.hexdigest()
+    url = f"{root.rstrip('/')}/{name}"
+    by_http = url.lower().startswith(("http://", "https://"))
+    pauses = list(_PAUSES) if by_http and name != PREPARED_FILE else []
+    while True:
+        try:
+            return _copy(urllib.request.urlopen(url, timeout=_PATIENCE) if by_http else _open_other(url), path)
+        except urllib.error.HTTPError as error:
+            if not (pauses and (error.code >= 500 or error.code in _BUSY)):
+                cure = "give the address of a folder that `trilitenet data prepare` has written"
+                raise DataError(f"{url}: cannot be fetched ({error}); {cure}") from error
+        except (OSError, ValueError, http.client.HTTPException) as error:
+            if not pauses:
+                reason = error.reason if isinstance(error, urllib.error.URLError) else error
+                raise DataError(f"{url}: cannot be fetched ({reason})") from error
+        time.sleep(pauses.pop(0))
 
 
-def _remote(url: str, *, quick: bool) -> Any:
-    """Open what is at an address; ``quick`` asks once, where WebDataset's own way tries for minutes."""
-    if quick and url.lower().startswith(("http://", "https://")):
-        return urllib.request.urlopen(url, timeout=_PATIENCE)
+def _open_other(url: str) -> Any:
+    """Open what is at an address of another kind, such as ``s3://...``, by the program that WebDataset has for it."""
     return import_extra("webdataset", "data").gopen(url)
+
+
+def _copy(source: Any, path: Path) -> str:
+    """Write what is read from a stream to a file, and return its SHA-256.
+
+    Raises:
+        OSError: If it ends early.
+    """
+    digest = hashlib.sha256()
+    with source, path.open("wb") as target:
+        while data := source.read(1 << 20):
+            target.write(data)
+            digest.update(data)
+    if missing := getattr(source, "length", None):  # of what an HTTP server announced
+        raise OSError(f"{missing} bytes are missing at its end")
+    return digest.hexdigest()
 
 
 def _parse_entry(line: bytes, name: str) -> dict[str, Any]:

@@ -18,6 +18,7 @@ import functools
 import hashlib
 import logging
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -40,6 +41,7 @@ __all__ = [
     "DrivingDataset",
     "MixedDataset",
     "SampleSource",
+    "as_address",
     "check_root",
     "decode",
     "decode_grey",
@@ -69,6 +71,8 @@ FOLDERS: Final = (IMAGE_FOLDER, *(folder for folder, _ in LABEL_FILES.values()))
 IMAGE_ENDINGS: Final = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
 
 _IGNORED: Final = 2
+_SINGLE_SLASH: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/(?!/)(.+)")
+"""An address as a path of it reads; not ``C:/``, which has one letter."""
 
 _READ_RGB: Final[int | None] = getattr(cv2, "IMREAD_COLOR_RGB", None)
 """Decode to RGB at once, which OpenCV can from 4.11 on."""
@@ -94,13 +98,27 @@ def is_image_file(name: str) -> bool:
     return not name.startswith(".") and name.lower().endswith(IMAGE_ENDINGS)
 
 
+def as_address(root: str | Path) -> str | None:
+    """Return the address (``https://...``) that a text is, or a path of it, which lost a slash; None of a folder."""
+    text = str(root)
+    if "://" in text:
+        return text
+    found = _SINGLE_SLASH.fullmatch(text)
+    if found is None or Path(text).exists():
+        return None
+    scheme, rest = found.groups()
+    return f"{scheme}:{'///' if scheme.lower() == 'file' else '//'}{rest}"
+
+
 def check_root(root: Path) -> None:
     """Check that the folder of a data set is there.
 
     Raises:
-        DataError: If it is not, or is a file.
+        DataError: If it is not, or is a file or an address.
     """
     if not root.is_dir():
+        if address := as_address(root):
+            raise DataError(f"{address}: is an address; give a folder on this machine")
         raise DataError(f"{root}: {'is a file, not the folder of a data set' if root.exists() else 'no such folder'}")
 
 

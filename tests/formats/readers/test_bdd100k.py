@@ -449,6 +449,70 @@ def test_images_may_be_in_a_folder_called_labelled(tmp_path: Path, place: str) -
     assert read_bdd100k(tmp_path).names("train") == ["a1", "a2"]
 
 
+@pytest.mark.parametrize("moved", [{"a2": "trainA"}, {"a1": "trainA", "a2": "testB/more"}])
+def test_images_in_folders_below_that_of_their_split_are_found(tmp_path: Path, moved: dict[str, str]) -> None:
+    raw_bdd.write_images(tmp_path)
+    raw_bdd.write_2018_merged(tmp_path)
+    folder = tmp_path / "images/100k/train"
+    for name, where in moved.items():
+        (folder / where).mkdir(parents=True)
+        (folder / f"{name}.jpg").rename(folder / where / f"{name}.jpg")
+    source = read_bdd100k(tmp_path)
+    assert {split: source.names(split) for split in source.splits} == {"train": ["a1", "a2"], "val": ["b1"]}
+    assert source.record("train", "a1").objects
+    other = folder / "other"
+    other.mkdir()
+    cv2.imwrite(str(other / "a1.jpg"), np.zeros((9, 9, 3), np.uint8))
+    with pytest.raises(DataError, match="two images are called 'a1'"):
+        read_bdd100k(tmp_path)
+
+
+def test_images_may_be_beside_their_annotations(tmp_path: Path) -> None:
+    raw_bdd.write_2018_merged(tmp_path)
+    for split, name in (("train", "a1"), ("val", "b1")):
+        path = tmp_path / f"{split}/annotations/bdd100k_labels_images_{split}.json"
+        path.parent.mkdir(parents=True)
+        (tmp_path / f"labels/{path.name}").rename(path)
+        for folder, width in (("images", 9), ("labels", 900)):  # the latter of drawn ones
+            (tmp_path / split / folder).mkdir()
+            cv2.imwrite(str(tmp_path / split / folder / f"{name}.jpg"), np.zeros((9, width, 3), np.uint8))
+    source = read_bdd100k(tmp_path)
+    assert [source.names(split) for split in source.splits] == [["a1"], ["b1"]]
+    assert source.record("train", "a1").image.parent.name == "images"
+    assert source.record("train", "a1").objects
+
+
+def test_a_folder_above_that_of_another_split_is_none_of_a_split(tmp_path: Path) -> None:
+    raw_bdd.write_images(tmp_path / "test/bdd100k")
+    assert read_bdd100k(tmp_path).splits == ("train", "val")
+
+
+def test_labels_without_images_and_images_without_labels_are_counted(raw: Path) -> None:
+    folder = raw / "images/100k/train"
+    (folder / "a1.jpg").rename(folder / "a3.jpg")
+    found = read_bdd100k(raw).found
+    lane = (raw / "labels/lane").exists()  # whose file lists a2, too
+    assert "train: labels of 1 images that are not there, such as a1" in found
+    assert f"train: {1 if lane else 2} images that no label file has, such as {'a3' if lane else 'a2'}" in found
+
+
+@pytest.mark.parametrize("kind", ["ids 2018", "ids 2020"])
+def test_masks_without_images_are_counted(tmp_path: Path, kind: str) -> None:
+    raw_bdd.write_images(tmp_path)
+    raw_bdd.write_masks(tmp_path, kind)
+    lane = tmp_path / "lane/masks/train/a4.png"
+    lane.parent.mkdir(parents=True)
+    for path in (lane, lane.with_name("._a5.png")):
+        path.touch()
+    told = "train: labels of {} images that are not there, such as {}".format
+    assert told(1, "a4") in read_bdd100k(tmp_path).found
+    (tmp_path / "images/100k/train/a1.jpg").unlink()
+    found = read_bdd100k(tmp_path).found
+    assert told(2, "a1") in found
+    assert "train: 1 images that no label file has, such as a2" in found
+    assert not [line for line in found if line.startswith("val: ") and "no label file" in line]  # told as 'nowhere'
+
+
 def test_hidden_files_are_passed_over(tmp_path: Path) -> None:
     raw_bdd.write_images(tmp_path)
     raw_bdd.write_2018_documents(tmp_path)

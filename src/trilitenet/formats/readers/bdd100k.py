@@ -9,7 +9,8 @@
    ``lane/polygons/lane_{split}.json``), and masks as ``drivable/masks/{split}/NAME.png``,
    ``drivable/colormaps/{split}/NAME.png`` and ``lane/masks/{split}/NAME.png``.
 
-The folders are found wherever they are below the given one. Files of a whole split run to more than a gigabyte, so
+The folders are found wherever they are below the given one, and so are images in folders of their own below that of a
+split (``images/100k/train/trainA``, as some copies have them). Files of a whole split run to more than a gigabyte, so
 they are indexed once and each image's part is read when it is wanted.
 """
 
@@ -191,6 +192,7 @@ def read_bdd100k(raw: str | Path, *, crosswalk: bool = False, vertical: bool = F
         sources = [f"{path.relative_to(root)} ({', '.join(sorted(tasks[path])) or 'nothing'})" for path in tasks]
         sources += [f"{path.relative_to(root)} (masks)" for path in (drivable and drivable[0], lane) if path]
         found.append(f"{split}: {len(images)} images; labels from {', '.join(sources) or 'nowhere'}")
+        found += _unmatched(split, splits[split])
         for path, unread in passed_over.items():
             rest = few([str(other.relative_to(root)) for other in unread])
             found.append(f"{split}: of several files of one kind, {path.relative_to(root)} is read, not {rest}")
@@ -482,16 +484,19 @@ def _survey(root: Path) -> tuple[dict[str, Path], list[Path]]:
 
 
 def _images(folders: dict[str, Path], split: str) -> dict[str, Path]:
-    """Return image name -> path of a split.
+    """Return image name -> path of a split: those in its folder and in all below, but in folders of another split.
 
     Raises:
         DataError: If two images have one name.
     """
+    others = "|".join(other for other in BDD100K_SPLITS if other != split)
     for pattern in (f"images/100k/{split}", f"100k/{split}", f"images/{split}", split):
         images: dict[str, Path] = {}
         for where, folder in folders.items():
-            match = re.search(rf"(^|/){pattern}$", where)
-            if match and (pattern.startswith("images/") or not _LABELS.search(where[: match.start()])):
+            match = re.search(rf"(^|/){pattern}(?=/|$)(?!.*/({others})(/|$))", where)
+            if match is None or _LABELS.search(where, match.end()):
+                continue
+            if pattern.startswith("images/") or not _LABELS.search(where[: match.start()]):
                 for path in visible(folder.iterdir()):
                     if path.suffix.lower() in IMAGE_ENDINGS[:2]:
                         first = images.setdefault(path.stem, path)
@@ -528,6 +533,27 @@ def _drivable_masks(
         if folder is not None:
             return folder, suffix, dict(values)
     return None
+
+
+def _unmatched(split: str, files: _Split) -> list[str]:
+    """Return a line on labels without their image, and one on images that no label file has."""
+    labelled = {*files.parts, *_stems(files.documents, ".json"), *_stems(files.lane_masks, ".png")}
+    if files.drivable_masks is not None:
+        folder, suffix, _ = files.drivable_masks
+        labelled |= _stems(folder, f"{suffix}.png")
+    without, bare = labelled - files.images.keys(), files.images.keys() - labelled
+    lines = []
+    if without:
+        lines.append(f"{split}: labels of {len(without)} images that are not there, such as {min(without)}")
+    if bare and labelled:
+        lines.append(f"{split}: {len(bare)} images that no label file has, such as {min(bare)}")
+    return lines
+
+
+def _stems(folder: Path | None, ending: str) -> set[str]:
+    """Return the names of a folder's files without the ending."""
+    files = () if folder is None else folder.iterdir()
+    return {path.name.removesuffix(ending) for path in visible(files) if path.name.endswith(ending)}
 
 
 def _lane_values(*, crosswalk: bool, vertical: bool) -> dict[int | tuple[int, int, int], str]:
