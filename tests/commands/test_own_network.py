@@ -136,10 +136,13 @@ def test_it_is_finished_for_use(excited: TrainResult) -> None:
 
 
 def test_what_it_costs_stands_beside_the_network_as_it_is(excited: TrainResult) -> None:
-    costs = {cost.variant: cost for cost in benchmark(table="cost", size=(64, 128), network="blocks.py:excited").costs}
+    costs = {cost.model: cost for cost in benchmark(table="cost", size=(64, 128), network="blocks.py:excited").costs}
     assert list(costs) == [name for variant in VARIANTS for name in (variant, f"{variant}, blocks.py:excited")]
     network = load_network(excited.weights, "blocks.py:excited")
     assert costs["tiny, blocks.py:excited"].parameters == count_parameters(network) < costs["tiny"].parameters
+    plain, own = benchmark("tiny", excited.weights, table="cost", network="blocks.py:excited").costs
+    assert (own.model, own.parameters) == (excited.weights.name, count_parameters(network))
+    assert plain.parameters == costs["tiny"].parameters
     timed = benchmark("tiny", str(excited.weights), network="blocks.py:excited", rounds=1, warmup=0, size=(64, 128))
     assert [row.model for row in timed.timings] == ["tiny", excited.weights.name]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
+import errno
 import io
 import json
 import multiprocessing
@@ -17,7 +18,9 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -25,8 +28,9 @@ import torch
 import yaml
 
 import trilitenet
+from tests.data.serving import serving
 from trilitenet.commands.train import _display, _nested, build_loss, train, training_data, validation_figures
-from trilitenet.commands.train_table import TableResult, train_table
+from trilitenet.commands.train_table import TableResult, TableRow, train_table
 from trilitenet.config import DEFAULT_ANCHORS, TASKS, Task
 from trilitenet.data.description import read_description, write_description
 from trilitenet.data.loader import epoch_order
@@ -149,10 +153,11 @@ def curves(folder: Path) -> list[tuple[int, str, float]]:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")  # two workers on a machine of one core
 def test_resume_is_bit_for_bit(scenes: Path, tmp_path: Path) -> None:
-    options = {"workers": 2, "multi_scale": (0.8, 1.6), "precision": "auto", "balancing": "uncertainty"}
-    train(**logged(scenes, tmp_path / "straight", max_steps=10, **options))
-    for steps in (5, 10):  # two steps an epoch: step 5 is in the middle of one
-        result = train(resume=steps > 5, **logged(scenes, tmp_path / "parts", max_steps=steps, **options))
+    options: dict[str, Any] = {"workers": 2, "multi_scale": (0.8, 1.6), "precision": "auto"}
+    options |= {"balancing": "uncertainty", "batch_size": 3}
+    train(**logged(scenes, tmp_path / "straight", max_steps=20, **options))
+    for steps in (10, 20):  # three steps an epoch: step 10 is in the middle of one
+        result = train(resume=steps > 10, **logged(scenes, tmp_path / "parts", max_steps=steps, **options))
         assert result.steps == steps
     same(state(tmp_path / "straight"), state(tmp_path / "parts"))
     assert curves(tmp_path / "straight") == curves(tmp_path / "parts")
@@ -162,6 +167,45 @@ def test_resume_is_bit_for_bit_with_validation_between(scenes: Path, tmp_path: P
     for steps in (3, 4):
         train(resume=steps > 3, **settings(scenes, tmp_path, **VALIDATED | {"max_steps": steps}))
     same(state(straight.folder), state(tmp_path))
+
+
+KILLED = """
+import io, json, os, random, signal, sys
+import numpy, torch
+from trilitenet.commands.train import train
+threads, settings = json.loads(sys.argv[1])
+torch.set_num_threads(threads)
+random.seed(0)
+numpy.random.seed(0)
+plain, written = torch.save, []
+def save(state, file):
+    whole = io.BytesIO()
+    plain(state, whole)
+    content = whole.getvalue()
+    if written:
+        file.write(content[: len(content) // 2])
+        file.flush()
+        os.kill(os.getpid(), signal.SIGKILL)
+    written.append(file.write(content))
+torch.save = save
+train(**settings)
+"""
+"""A run that is killed when its second checkpoint is half written."""
+
+
+def test_a_run_killed_while_it_writes_a_checkpoint_goes_on_bit_for_bit(scenes: Path, tmp_path: Path) -> None:
+    straight, run = (logged(scenes, tmp_path / name, epochs=2) for name in ("straight", "run"))
+    train(**straight)
+    words = [sys.executable, "-c", KILLED, json.dumps([torch.get_num_threads(), run])]
+    assert subprocess.run(words, check=False, timeout=280).returncode == -signal.SIGKILL
+    assert len(list((tmp_path / "run").glob(".last.ckpt.*.part"))) == 1
+    assert state(tmp_path / "run")["step"] == 2  # of four
+    assert train(resume=True, **run).finished
+    same(state(tmp_path / "straight"), state(tmp_path / "run"))
+    assert curves(tmp_path / "straight") == curves(tmp_path / "run")
+    weights = [(tmp_path / name / "final.safetensors").read_bytes() for name in ("straight", "run")]
+    assert weights[0] == weights[1]
+    assert not list((tmp_path / "run").glob(".*.part"))
 
 
 def test_a_setting_may_be_a_path_one_for_several_or_none(tmp_path: Path) -> None:
@@ -246,6 +290,18 @@ def test_what_has_no_effect_is_told(scenes: Path, tmp_path: Path, caplog: pytest
         train(**settings(data, tmp_path / "lane", tasks=("lane",)))
 
 
+def test_a_warm_up_of_the_whole_run_is_told(scenes: Path, begun: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def told(**more: Any) -> str:
+        caplog.clear()
+        train(resume=True, **settings(scenes, begun, max_steps=1, **more))  # which is at its end; two steps an epoch
+        return caplog.text
+
+    assert "warm-up" not in told(warmup_steps=19)
+    assert "warm-up takes the whole run (20 steps); lower --warmup-steps\n" in told(warmup_steps=20)
+    assert "(6 steps); lower --warmup-epochs\n" in told(epochs=3)
+    assert "(4 steps); lower --warmup-epochs and --warmup-steps\n" in told(epochs=2)
+
+
 def test_classes_that_the_first_data_lacks_are_told(
     scenes: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -267,6 +323,27 @@ def test_a_run_that_cannot_start_leaves_the_earlier_one(
     with pytest.raises(MissingExtraError, match="wandb"):
         train(**settings(scenes, begun, loggers=("csv", "wandb")), overwrite=True)
     assert sorted(path.name for path in begun.iterdir()) == before
+    wandb = SimpleNamespace(init=Mock(side_effect=Exception("No API key configured")))
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    with pytest.raises(TrainingError, match=r"^wandb: cannot log \(No API key configured\); see `wandb login`"):
+        train(**settings(scenes, begun, loggers=("csv", "wandb")), overwrite=True)
+    assert sorted(path.name for path in begun.iterdir()) == before
+
+
+def test_a_tracking_server_that_fails_ends_no_run_and_goes_on_with_it_later(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mlflow = Mock()
+    mlflow.start_run.return_value.info.run_id = "m1"
+    mlflow.log_metrics.side_effect = OSError("no connection")
+    monkeypatch.setitem(sys.modules, "mlflow", mlflow)
+    options = logged(scenes, tmp_path, loggers=("mlflow", "csv"))
+    assert train(**options, max_steps=2).finished
+    assert len([row for row in curves(tmp_path) if row[1] == "train/total"]) == 2
+    train(**options, max_steps=3, resume=True)
+    assert [told.kwargs["run_id"] for told in mlflow.start_run.mock_calls] == [None, "m1"]
+    train(**options, max_steps=1, overwrite=True)
+    assert mlflow.start_run.mock_calls[-1].kwargs["run_id"] is None
 
 
 def test_going_on_with_other_frozen_parts_is_refused(scenes: Path, tmp_path: Path) -> None:
@@ -768,6 +845,8 @@ def test_a_step_without_memory_is_told_in_one_line(
 def test_refusals(scenes: Path, tmp_path: Path, begun: Path) -> None:
     with pytest.raises(ConfigError, match="no data"):
         train()
+    with pytest.raises(ConfigError, match=r"default_tiny: no such recipe; give the path of .* --help` lists every key"):
+        train("default_tiny")
     with pytest.raises(ConfigError, match="did you mean 'epochs'"):
         train(epoch=3)
     with pytest.raises(ConfigError, match="--sampling: not YAML"):
@@ -814,6 +893,42 @@ def test_a_prepared_data_set_is_trained_on_without_validation(scenes: Path, tmp_
     with pytest.raises(DataError, match="prepared with --mask-above 64, 1 is wanted"):
         train(**options)
     assert train(augmentation__mask_above=64, **options).steps == 1
+
+
+def test_a_prepared_data_set_is_trained_on_from_an_address(
+    scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from trilitenet.apps.cli import main
+
+    def run(*words: str) -> tuple[int, str]:
+        code = main(["train", str(recipe), *words])
+        return code, capsys.readouterr().err
+
+    prepare(scenes, tmp_path / "here", canvas=(64, 128), shard_size=1)
+    options = settings(tmp_path / "here", tmp_path / "run", cache=str(tmp_path / "copies"), log_every=9)
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text(json.dumps(options))
+    with serving(tmp_path) as site:
+        address = f"{site.address}/here"
+        code, told = run("--data", address, "--val-split", "val")
+        assert (code, told.count("\n")) == (1, 1)
+        assert told.startswith(f"error: {address}: what is at an address is prepared")
+        assert "--val-split '' to train without" in told
+        assert run("--data", address, "--max-steps", "1", "--extra-data", f"{{{address}: 2}}")[0] == 0
+        shards = [f"train-{number:06}.tar" for number in range(10)]
+        assert [name for name in site.asked if name.endswith(".tar")] == shards  # all before the step that needs four
+        assert read_recipe(tmp_path / "run/config.yaml").data == address
+        assert read_card(tmp_path / "run/final.safetensors").training_data == ("here, here (train): 20 images",)
+        assert run("--data", address, "--output", str(tmp_path / "one"), "--max-steps", "2")[0] == 0
+    train(**options | {"output": str(tmp_path / "two"), "max_steps": 2})
+    same(state(tmp_path / "one"), state(tmp_path / "two"))
+    output = ("--output", str(tmp_path / "one"), "--resume", "--max-steps", "3", "--cache")
+    moved = (tmp_path / "copies").rename(tmp_path / "moved")
+    code, told = run("--data", address, *output, str(moved))  # of the copies: nobody answers
+    assert (code, "cache" in told.partition("other settings")[2]) == (0, False)
+    code, told = run("--data", address, *output, str(tmp_path / "none"))
+    refused = f"[Errno {errno.ECONNREFUSED}] {os.strerror(errno.ECONNREFUSED)}"
+    assert (code, told) == (1, f"error: {address}/prepared.json: cannot be fetched ({refused})\n")
 
 
 def test_a_run_goes_on_with_its_own_data_alone(scenes: Path, tmp_path: Path) -> None:
@@ -1001,16 +1116,54 @@ def test_a_checkpoint_with_the_wrong_content_is_told_in_one_line(scenes: Path, b
 
 
 @pytest.mark.parametrize("recipe", RECIPES, ids=lambda path: path.stem)
-def test_every_recipe_runs_a_step(recipe: Path, scenes: Path, tmp_path: Path) -> None:
-    assert train(recipe, **settings(scenes, tmp_path, epochs=1, max_steps=1, batch_size=2)).steps == 1
+def test_every_recipe_runs_three_steps(recipe: Path, scenes: Path, tmp_path: Path) -> None:
+    given = settings(scenes, tmp_path, max_steps=3, batch_size=2)
+    for name in ("epochs", "warmup_steps", "auto_anchor"):  # cheap as the recipe has them
+        del given[name]
+    assert train(recipe, **given).steps == 3
+    own, run = read_recipe(recipe), read_recipe(tmp_path / "config.yaml")
+    assert run == dataclasses.replace(own, **given)
     assert recipe.read_text().startswith("# ")
     assert "Measured result" in recipe.read_text()
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda path: path.stem)
 def test_every_table_names_recipes_that_exist(table: Path) -> None:
-    for recipe in yaml.safe_load(table.read_text())["rows"].values():
+    content = yaml.safe_load(table.read_text())
+    for recipe in content["rows"].values():
         read_recipe(table.parent / recipe)
+    own = {"components": ("Baseline", False), "left_out": ("Complete", False), "tasks": (None, True)}
+    assert (content.get("compare"), content.get("tick_tasks", False)) == own[table.stem]
+
+
+def test_a_table_shows_rises_and_ticks_as_the_paper_does() -> None:
+    name = "paper/detection/recall"
+    rows = (
+        TableRow("Baseline", TASKS, {name: 0.784}, 450_000, 1_770_000_000),
+        TableRow("+ EMA", ("detection", "lane"), {name: 0.816, "paper/lane/iou": 0.276}, 590_000, 1_690_000_000),
+    )
+    head, _, first, second = TableResult("Parts", rows, True, compare="Baseline").summary().splitlines()[4:]
+    assert head.startswith("| Method | Recall (%) | ")
+    assert first == "| Baseline | 78.4 | - | - | - | - | 0.45 | 1.77 |"
+    assert second == "| + EMA | 81.6 (+3.2) | - | - | - | 27.6 | 0.59 (+0.14) | 1.69 (-0.08) |"
+    head, _, first, second = TableResult("Parts", rows, True, tick_tasks=True).summary().splitlines()[4:]
+    assert head.startswith("| Det | DA | LL | Recall (%) | ")
+    assert first == "| ✓ | ✓ | ✓ | 78.4 | - | - | - | - | 0.45 | 1.77 |"
+    assert second.startswith("| ✓ |  | ✓ | 81.6 | - | - | - | 27.6 | 0.59 |")
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        ("compare: Al", "compare names no row; did you mean 'All'"),
+        ("compares: All", "unknown key 'compares'; did you mean 'compare'"),
+        ("tick_tasks: 2", "tick_tasks must be true or false, got 2"),
+    ],
+)
+def test_a_table_that_says_what_is_not_known_is_refused(tmp_path: Path, more: str, told: str) -> None:
+    (tmp_path / "t.yaml").write_text(f"title: Parts\nrows: {{All: a.yaml}}\n{more}\n")
+    with pytest.raises(ConfigError, match=rf"t\.yaml: {told}"):
+        train_table(tmp_path / "t.yaml", data=tmp_path, output=tmp_path / "runs")
 
 
 def test_a_table_is_trained_once_and_printed(scenes: Path, tmp_path: Path) -> None:
@@ -1018,7 +1171,7 @@ def test_a_table_is_trained_once_and_printed(scenes: Path, tmp_path: Path) -> No
     (tmp_path / "a.yaml").write_text("tasks: [drivable]\nvariant: tiny\n")
     (tmp_path / "b.yaml").write_text("base: a.yaml\npcaa: false\n")
     table = tmp_path / "t.yaml"
-    table.write_text("title: Parts\nrows: {With: a.yaml, Without: b.yaml}\n")
+    table.write_text("title: Parts\ncompare: With\nrows: {With: a.yaml, Without: b.yaml}\n")
     more = settings(scenes, tmp_path, max_steps=1, val_split="val", epochs=1, pictures=0)
     more = {key: list(value) if isinstance(value, tuple) else value for key, value in more.items()}
     more.pop("data"), more.pop("output")
@@ -1026,6 +1179,8 @@ def test_a_table_is_trained_once_and_printed(scenes: Path, tmp_path: Path) -> No
         result = train_table(table, data=scenes, output=tmp_path / "runs", settings=yaml.safe_dump(more))
     text = result.summary()
     assert re.search(r"\| With \| - \| - \| \d+\.\d \| - \| - \| 0\.0\d \| 0\.0\d \|", text)
+    assert re.search(r"\| Without \| - \| - \| \d+\.\d \([+-]\d+\.\d\) \| - \| - \| 0\.0\d \(-0\.0\d\) \|", text)
+    assert (tmp_path / "runs" / "t.md").read_text(encoding="utf-8") == text + "\n"
     assert result.rows[1].parameters < result.rows[0].parameters
     assert result.exit_code == 0
     again: dict[str, Any] = {"data": scenes, "output": tmp_path / "runs"}

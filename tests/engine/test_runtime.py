@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+import types
 import weakref
 from pathlib import Path
 from types import FrameType
@@ -222,6 +223,33 @@ def test_processes_that_could_not_meet_are_refused(monkeypatch: pytest.MonkeyPat
         pass
 
 
+ON_GPUS = """
+import types
+hosts = runtime.hosts_group(types.SimpleNamespace(world_size=2, device=torch.device("cuda")))
+flags = torch.ones(2)
+torch.distributed.all_reduce(flags, group=hosts)
+"""
+
+
+def test_processes_with_gpus_talk_from_host_to_host(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pair(script, ON_GPUS) as fabric:
+        assert runtime.hosts_group(fabric) is None  # the default one of a CPU does so
+        names: dict[str, Any] = {"runtime": runtime, "torch": torch}
+        exec(ON_GPUS, names)
+        assert torch.distributed.get_backend(names["hosts"]) == "gloo"
+        assert names["hosts"] is not torch.distributed.group.WORLD
+        assert names["flags"].tolist() == [2.0, 2.0]
+
+    def new_group(**_: object) -> None:
+        raise RuntimeError("gloo connectFullMesh failed with ...\n[enforce fail]")
+
+    monkeypatch.setattr(torch.distributed, "new_group", new_group)
+    device = torch.device("cuda")
+    with pytest.raises(TrainingError, match=r"host to host \(gloo .*\); set GLOO_SOCKET_IFNAME to the network"):
+        runtime.hosts_group(types.SimpleNamespace(world_size=2, device=device))
+    assert runtime.hosts_group(types.SimpleNamespace(world_size=1, device=device)) is None
+
+
 @pytest.mark.slow
 def test_a_first_process_that_does_not_notice_is_ended(script: Path) -> None:
     words = [sys.executable, str(script), "time.sleep(600)", "raise DataError('a.jpg: is broken')"]
@@ -275,6 +303,12 @@ def test_bf16_without_instructions_for_it_is_told(
     caplog.clear()
     with runtime.running_fabric("cpu", "auto"), runtime.running_fabric("cpu", "32-true"):
         assert not caplog.text
+
+
+def test_fp16_on_a_processor_is_refused() -> None:
+    told = pytest.raises(ConfigError, match="precision 16-mixed is for GPUs; on a CPU use bf16-mixed or 32-true")
+    with told, runtime.running_fabric("cpu", "16-mixed"):
+        pass
 
 
 def test_a_pytorch_that_cannot_tell_of_bf16_computes_in_fp32(

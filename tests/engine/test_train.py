@@ -13,15 +13,17 @@ import numpy as np
 import pytest
 import torch
 
+from trilitenet.config import TASKS, Task
 from trilitenet.data.batches import Batch, collate
 from trilitenet.data.sample import Sample
+from trilitenet.engine.loggers import RunEnd
 from trilitenet.engine.recipe import TrainConfig
 from trilitenet.engine.rescale import draw_size
 from trilitenet.engine.train import Trainer, TrainResult
 from trilitenet.errors import BackendError, OutputError, TrainingError, WeightsError
 from trilitenet.losses.detection import DetectionLoss
 from trilitenet.losses.distillation import DistillationLoss
-from trilitenet.losses.multitask import MultiTaskLoss
+from trilitenet.losses.multitask import LossTerms, MultiTaskLoss
 from trilitenet.losses.segmentation import SegmentationLoss
 from trilitenet.models.trilitenet import TriLiteNet, build_network
 from trilitenet.models.weights import load_network, read_card
@@ -69,12 +71,13 @@ class Log:
 
     def __init__(self) -> None:
         self.rows: list[tuple[int, dict[str, float]]] = []
+        self.ends: list[RunEnd] = []
 
     def log(self, values: Mapping[str, float], step: int) -> None:
         self.rows.append((step, dict(values)))
 
-    def close(self) -> None:
-        pass
+    def close(self, end: RunEnd = "finished") -> None:
+        self.ends.append(end)
 
     def of(self, name: str) -> list[float]:
         return [values[name] for _, values in self.rows if name in values]
@@ -95,17 +98,25 @@ def trainer(
     config = TrainConfig(**plain | settings)
     network = build_network("tiny", 1, config.tasks)
     masks = [SegmentationLoss(0.5, 0.5), SegmentationLoss(0.5, 0.5)]
-    loss = MultiTaskLoss(DetectionLoss(network.anchors, 1) if "detection" in config.tasks else None, *masks)
+    boxes = DetectionLoss(network.anchors, 1) if "detection" in config.tasks else None
+    loss = MultiTaskLoss(boxes, *masks, balancing=config.balancing)
     fabric = lightning_fabric.Fabric(accelerator="cpu", devices=1, precision="32-true")
     fabric.launch()
-    taught = None if teacher is None else (teacher, DistillationLoss(network.anchors, teacher.anchors, (1.0, 1.0, 1.0)))
+    taught = (
+        None if teacher is None else (teacher, DistillationLoss(network.anchors, teacher.anchors, config.distillation))
+    )
     options: dict[str, Any] = {"validate": validate, "measured_on": measured_on, "display": display}
     return Trainer(config, network, loss, Batches(batches), fabric, network.card, teacher=taught, **options)
 
 
 def fit(run: Trainer, *, resume: bool = False) -> tuple[TrainResult, Log]:
     told = Log()
-    return run.fit(run.folder / "last.ckpt" if resume else None, lambda _step, _validated: [told]), told
+
+    def build(_step: int, _validated: int, begin: Callable[[], None]) -> list[Log]:
+        begin()
+        return [told]
+
+    return run.fit(run.folder / "last.ckpt" if resume else None, build), told
 
 
 def test_accumulated_batches_follow_each_other_over_a_stop(tmp_path: Path) -> None:
@@ -346,8 +357,82 @@ def test_a_teacher_adds_to_the_loss(tmp_path: Path) -> None:
     for one in (None, teacher):
         _, told = fit(trainer(tmp_path / str(one is None), teacher=one, max_steps=1))
         totals.append(told.of("train/total")[0])
+        parts = sum(value for name, value in told.rows[0][1].items() if name.startswith("train/")) - totals[-1]
+        assert parts == pytest.approx(totals[-1])
     assert totals[1] > totals[0] + 0.01
     assert not any(module.training for module in teacher.modules())
+
+
+@pytest.mark.parametrize(
+    ("tasks", "taught", "weights", "terms"),
+    [
+        (("drivable",), None, (1, 1, 1), "drivable_focal drivable_tversky"),
+        (("detection", "lane"), None, (1, 1, 1), "box objectness classification lane_focal lane_tversky"),
+        (("drivable",), TASKS, (1, 1, 1), "drivable_focal drivable_tversky distil_drivable"),
+        (
+            ("drivable", "lane"),
+            ("lane",),
+            (1, 1, 1),
+            "drivable_focal drivable_tversky lane_focal lane_tversky distil_lane",
+        ),
+        (
+            ("drivable", "lane"),
+            TASKS,
+            (1, 1, 0),
+            "drivable_focal drivable_tversky lane_focal lane_tversky distil_drivable",
+        ),
+        (TASKS, ("detection",), (1, 1, 1), " ".join((*LossTerms._fields[1:], "distil_detection"))),
+    ],
+)
+def test_the_losses_of_the_tasks_and_lessons_that_there_are_are_told(
+    tmp_path: Path,
+    tasks: tuple[Task, ...],
+    taught: tuple[Task, ...] | None,
+    weights: tuple[float, float, float],
+    terms: str,
+) -> None:
+    display = Mock()
+    teacher = None if taught is None else build_network("tiny", 1, taught)
+    _, told = fit(trainer(tmp_path, tasks=tasks, teacher=teacher, distillation=weights, display=display, max_steps=1))
+    ((_, values),) = told.rows
+    losses = {name: values[f"train/{name}"] for name in ("total", *terms.split())}
+    assert list(values) == [*(f"train/{name}" for name in losses), "lr", "images_per_second"]
+    assert all(value > 0 for name, value in losses.items() if name != "classification")  # of a single class
+    line = display.step.call_args.args[2].partition(": ")[2].partition(" (")[0]
+    assert line == " ".join(f"{name} {value:.4f}" for name, value in losses.items())
+
+
+def test_the_learned_balance_is_told(tmp_path: Path) -> None:
+    run = trainer(tmp_path, tasks=("drivable", "lane"), balancing="uncertainty", max_steps=2, lr=0.1)
+    _, told = fit(run)
+    assert run.loss.log_variance is not None
+    learned = [0.3 * math.exp(-value) for value in run.loss.log_variance[1:].tolist()]
+    assert [told.of(f"train/weight_{task}")[-1] for task in ("drivable", "lane")] == pytest.approx(learned)
+    assert 0.3 not in learned
+    assert not told.of("train/weight_detection")
+
+
+def test_the_loggers_are_told_how_a_run_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ends: list[tuple[RunEnd, bool]] = []
+
+    def close(_: Log, end: RunEnd) -> None:
+        ends.append((end, (tmp_path / "final.safetensors").exists()))
+
+    def stop(self: Trainer, *_: object) -> bool:
+        return self.step == 2
+
+    monkeypatch.setattr(Log, "close", close)
+    options: dict[str, Any] = {"tasks": ("drivable",), "max_steps": 3}
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "_stopped", stop)
+        fit(trainer(tmp_path, **options))
+    for error in (KeyboardInterrupt, RuntimeError):
+        with monkeypatch.context() as patch:
+            patch.setattr(Trainer, "_train_epoch", Mock(side_effect=error))
+            with pytest.raises(error):
+                fit(trainer(tmp_path, **options), resume=True)
+    fit(trainer(tmp_path, **options), resume=True)
+    assert ends == [("stopped", False), ("stopped", False), ("failed", False), ("finished", True)]
 
 
 def test_a_bad_step_is_no_part_of_the_logged_losses(
@@ -373,6 +458,25 @@ def test_logged_losses_are_the_mean_of_the_steps_since_the_last_ones(tmp_path: P
     assert len(each.of("train/total")) == 2
     assert both.of("train/total") == [pytest.approx(sum(each.of("train/total")) / 2)]
     assert each.of("train/total")[0] != pytest.approx(each.of("train/total")[1], rel=1e-3)
+
+
+def test_processes_tell_each_other_of_a_stop_past_their_devices(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hosts, groups = object(), []
+
+    def all_reduce(flags: torch.Tensor, *, group: object) -> None:
+        assert flags.device.type == "cpu"
+        groups.append(group)
+        flags += torch.tensor([0.0, 1.0])  # of the other process
+
+    monkeypatch.setattr("trilitenet.engine.train.hosts_group", lambda _fabric: hosts)
+    run = trainer(tmp_path, tasks=("drivable",))
+    monkeypatch.setattr(torch.distributed, "all_reduce", all_reduce)
+    run.fabric = Mock(world_size=2, device=torch.device("meta"))  # which tells nothing
+    assert run._any(True, False) == (True, True)
+    assert run._any(False, False) == (False, True)
+    assert groups == [hosts, hosts]
 
 
 def test_an_error_of_the_network_is_not_taken_for_one_of_a_worker(
@@ -409,7 +513,7 @@ def test_what_must_be_the_same_on_resuming_is_compared(
 
 
 def test_a_log_that_cannot_be_closed_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def close(self: Log) -> None:
+    def close(self: Log, end: RunEnd) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Log, "close", close)

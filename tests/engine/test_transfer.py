@@ -48,6 +48,8 @@ def test_classes_in_another_order_answer_to_their_names() -> None:
     image = torch.randn(1, 3, 64, 64)
     with torch.no_grad():
         before, after = source.eval()(image).detection, network.eval()(image).detection
+    assert before is not None
+    assert after is not None
     for old, new in zip(before, after, strict=True):
         torch.testing.assert_close(new, old[..., [0, 1, 2, 3, 4, 7, 5, 6]])
 
@@ -58,6 +60,7 @@ def test_frozen_parts_learn_nothing() -> None:
     keep_frozen(network, ("encoder", "lane.up1"))
     before = {name: value.clone() for name, value in network.encoder.state_dict().items()}
     out = network(torch.randn(2, 3, 64, 128))
+    assert out.drivable is not None
     out.drivable.square().mean().backward()
     for part in ("encoder", "lane.up1"):
         parameters = [*network.get_submodule(part).parameters()]

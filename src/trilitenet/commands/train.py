@@ -32,6 +32,7 @@ from rich.progress import (
 )
 from rich.table import Column
 
+from trilitenet import __version__
 from trilitenet.commands.load import own_builder
 from trilitenet.commands.paths import StrPath, optional_path
 from trilitenet.commands.progress import show_bars
@@ -40,8 +41,8 @@ from trilitenet.data.contact_sheet import as_perception
 from trilitenet.data.description import folder_name
 from trilitenet.data.identity import identify, parts_of
 from trilitenet.data.loader import build_loader
-from trilitenet.data.prepared import PreparedDataset, is_prepared, open_dataset
-from trilitenet.data.reading import DrivingDataset, MixedDataset, SampleSource, sampling_weights
+from trilitenet.data.prepared import PreparedDataset, default_cache, is_prepared, open_dataset
+from trilitenet.data.reading import DrivingDataset, MixedDataset, SampleSource, as_address, sampling_weights
 from trilitenet.data.transforms import TrainTransform, Transform
 from trilitenet.engine.anchors import box_sizes, fit_anchors
 from trilitenet.engine.evaluate import evaluate
@@ -87,6 +88,11 @@ def train(
         The run's folder, weights and figures.
     """
     recipe = optional_path(recipe)
+    if recipe is not None and not recipe.exists():
+        raise ConfigError(
+            f"{recipe}: no such recipe; give the path of a YAML file, such as those in recipes/ of the repository (at "
+            f"version {__version__}), or of your own: `trilitenet train --help` lists every key"
+        )
     config = read_recipe(recipe, _nested(fields))
     if not config.data:
         raise ConfigError("no data: give the root folder of a data set with --data")
@@ -95,6 +101,11 @@ def train(
         raise OutputError(
             f"{folder}: holds a run already, or files that a run would replace; --resume it, --overwrite it, or give "
             "another --output"
+        )
+    if config.val_split and (address := as_address(config.data)):
+        raise DataError(
+            f"{address}: what is at an address is prepared, and figures are measured on images as they are; give "
+            "--val-split '' to train without, and measure with `trilitenet evaluate`"
         )
     if config.val_split and is_prepared(Path(config.data)):
         raise DataError(
@@ -126,6 +137,11 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
     torch.manual_seed(config.seed)
     with _display(quiet=not fabric.is_global_zero) as display:
         dataset = training_data(config)
+        for address in filter(None, map(as_address, (config.data, *config.extra_data))):
+            display.line(f"{address}: copied to {config.cache or default_cache()}")
+        for part in parts_of(dataset):
+            if isinstance(part, PreparedDataset):  # before processes read: each would wait for every shard in a step
+                part.copy(display.shards)
         _check_labels(config, dataset, display)
         loader = build_loader(
             dataset,
@@ -165,9 +181,10 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
             teacher=_teacher(config, network),
             display=display,
         )
+        _warn_of_warmup(config, trainer)
         result = trainer.fit(
             folder / CHECKPOINT_NAME if resume else None,
-            lambda *steps: build_loggers(config.loggers, folder, config.to_dict(), *steps),
+            lambda *begin: build_loggers(config.loggers, folder, config.to_dict(), *begin),
         )
         if fabric.is_global_zero and result.finished and "csv" in config.loggers:
             predictor = Predictor(TorchBackend(trainer.averaged, device))
@@ -180,6 +197,18 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
                 pictures=[] if validation is None else _pictures(predictor, validation, config.pictures),
             )
     return result
+
+
+def _warn_of_warmup(config: TrainConfig, trainer: Trainer) -> None:
+    """Warn of a warm-up that never ends, as a schedule for much data has on little."""
+    steps = trainer.schedule.steps
+    if trainer.schedule.warmup == steps:
+        warmups = {
+            "--warmup-epochs": round(config.warmup_epochs * trainer.epoch_steps),
+            "--warmup-steps": config.warmup_steps,
+        }
+        flags = " and ".join(flag for flag, length in warmups.items() if length >= steps)
+        _LOGGER.warning("warm-up takes the whole run (%d steps); lower %s", steps, flags)
 
 
 def _command(config: TrainConfig, *, resume: bool, overwrite: bool) -> list[str]:
@@ -213,6 +242,7 @@ def training_data(config: TrainConfig) -> SampleSource:
         split=config.train_split,
         canvas=None if boxes_alone else config.input_size,
         mask_above=config.augmentation.mask_above,
+        cache=config.cache,
     )
     first = opened(config.data, class_names=config.classes)
     if not config.extra_data:
@@ -505,6 +535,10 @@ class _Display:
     def validation(self, images: int, count: int) -> None:
         """Show how many images the network has been measured on, and of how many."""
         self._aside("validation", images, count)
+
+    def shards(self, done: int, count: int) -> None:
+        """Show how many shards of a data set at an address are on this machine, and of how many."""
+        self._aside("shards", done, count)
 
     def labels(self, images: int, count: int) -> None:
         """Show of how many images the annotations have been looked at, and of how many they may have to be."""

@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any, Final
 
 from trilitenet.commands.evaluate import evaluate, hash_dataset, known_report
-from trilitenet.commands.paths import StrPath
+from trilitenet.commands.paths import StrPath, check_writable
 from trilitenet.commands.tables import PAPER_COLUMNS, markdown_row
 from trilitenet.commands.train import train, training_data
-from trilitenet.config import parse, parse_yaml, read_yaml
+from trilitenet.config import TASKS, Task, parse, parse_yaml, read_yaml
 from trilitenet.data.identity import identify, tell_apart
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.checkpoint import read_checkpoint
 from trilitenet.engine.recipe import TrainConfig, read_recipe
 from trilitenet.engine.train import CHECKPOINT_NAME, holds_run
-from trilitenet.errors import ConfigError, OutputError, brief
+from trilitenet.errors import ConfigError, OutputError, brief, did_you_mean, shown, write_file
 from trilitenet.models.cost import count_multiply_adds, count_parameters
 from trilitenet.models.trilitenet import TriLiteNet
 from trilitenet.models.weights import load_network, read_card
@@ -28,10 +28,12 @@ __all__ = ["TableResult", "TableRow", "train_table"]
 _REPORT: Final = "evaluation"
 _WEIGHTS: Final = "final.safetensors"
 _FREE: Final = frozenset(
-    {"data", "output", "device", "devices", "num_nodes", "workers", "compile"}
+    {"data", "cache", "output", "device", "devices", "num_nodes", "workers", "compile"}
     | {"loggers", "log_every", "pictures", "checkpoint_every"}
 )
 """Settings in which a row may differ from what is asked for: the data's content is compared by itself."""
+_TICKS: Final[dict[Task, str]] = dict(zip(TASKS, ("Det", "DA", "LL"), strict=True))
+"""Tasks -> the paper's headings of columns that tick them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,12 +42,14 @@ class TableRow:
 
     Attributes:
         name: Of the row.
+        tasks: Of the network.
         figures: ``paper/task/name`` -> value in [0, 1] on the validation split; a task it lacks is left out.
         parameters: Number of parameters.
         multiply_adds: For one input.
     """
 
     name: str
+    tasks: tuple[Task, ...]
     figures: dict[str, float]
     parameters: int
     multiply_adds: int
@@ -59,12 +63,16 @@ class TableResult:
         title: Of the table.
         rows: In the paper's order.
         finished: False if a run was stopped; its row and those after it are missing.
+        compare: Name of the row that the others are shown beside, with how much they are above it; None for none.
+        tick_tasks: Rows are told by their tasks, each ticked in a column of its own, not by their names.
         first: Whether this is the first of the runs' processes, which alone tells of them.
     """
 
     title: str
     rows: tuple[TableRow, ...]
     finished: bool
+    compare: str | None = None
+    tick_tasks: bool = False
     first: bool = True
 
     @property
@@ -76,7 +84,8 @@ class TableResult:
         """Return the table in Markdown; nothing for a process that is not the first."""
         if not self.first:
             return ""
-        head = ("Method", *PAPER_COLUMNS.values(), "Params (M)", "Multiply-adds (G)")
+        names = tuple(_TICKS.values()) if self.tick_tasks else ("Method",)
+        head = (*names, *PAPER_COLUMNS.values(), "Params (M)", "Multiply-adds (G)")
         lines = [
             self.title if self.finished else f"{self.title} (stopped; go on with --resume)",
             "",
@@ -85,11 +94,26 @@ class TableResult:
             markdown_row(head),
             markdown_row(["---"] * len(head)),
         ]
+        digits = (*(1 for _ in PAPER_COLUMNS), 2, 2)
+        base = next((row for row in self.rows if row.name == self.compare), None)
         for row in self.rows:
-            cells = [f"{100 * row.figures[name]:.1f}" if name in row.figures else "-" for name in PAPER_COLUMNS]
-            cost = (f"{row.parameters / 1e6:.2f}", f"{row.multiply_adds / 1e9:.2f}")
-            lines.append(markdown_row([row.name, *cells, *cost]))
+            told = tuple("✓" if task in row.tasks else "" for task in _TICKS) if self.tick_tasks else (row.name,)
+            before = [math.nan] * len(digits) if base is None or row is base else _numbers(base)
+            lines.append(markdown_row([*told, *map(_cell, _numbers(row), before, digits)]))
         return "\n".join(lines)
+
+
+def _numbers(row: TableRow) -> list[float]:
+    """Return what a row shows: figures in per cent (NaN where it lacks one), parameters in M, multiply-adds in G."""
+    figures = [100 * row.figures.get(name, math.nan) for name in PAPER_COLUMNS]
+    return [*figures, row.parameters / 1e6, row.multiply_adds / 1e9]
+
+
+def _cell(value: float, before: float, digits: int) -> str:
+    """Return a number, and by how much it is above another one, where there are such."""
+    if math.isnan(value):
+        return "-"
+    return f"{value:.{digits}f}" + ("" if math.isnan(before) else f" ({value - before:+.{digits}f})")
 
 
 def train_table(
@@ -100,9 +124,10 @@ def train_table(
     Rows that are done are not trained again. A row's report is in its folder, under evaluation.
 
     Args:
-        table: A YAML file with a title and rows: name -> recipe, relative to the file.
+        table: A YAML file with a title and rows: name -> recipe, relative to the file; with ``compare`` (a row's name)
+            the others show how much they are above that one, with ``tick_tasks: true`` tasks are ticked in columns.
         data: Root folder of a data set in the published layout.
-        output: Folder of the runs, a folder each.
+        output: Folder of the runs, a folder each, and of the table, called as its file but .md.
         resume: Go on with rows that were stopped, of which those without a checkpoint start anew; otherwise they are
             refused.
         settings: Settings of every run that replace the recipes', in YAML: '{epochs: 10, workers: 4}'.
@@ -114,12 +139,14 @@ def train_table(
         OutputError: If a row that is done, or gone on with, was trained with other settings or on other data; if one
             was stopped and is not gone on with.
     """
-    title, recipes = _read(Path(table))
+    plan = _read(Path(table))
+    recipes, printed = plan.recipes, Path(output, f"{Path(table).stem}.md")
     more = parse_yaml(settings, "settings") if settings else {}
     if not isinstance(more, dict) or {"data", "output"} & more.keys() or None in more.values():
         raise ConfigError(
             f"settings must be YAML such as '{{epochs: 10}}', without data and output, and no null, got {settings!r}"
         )
+    check_writable(printed)
     fields: dict[str, Any] = {str(name): value for name, value in more.items()} | {"data": str(Path(data))}
     configs = {name: read_recipe(recipe, fields) for name, recipe in recipes.items()}
     done = {name: _is_done(Path(output, recipe.stem), configs[name], resume=resume) for name, recipe in recipes.items()}
@@ -138,9 +165,18 @@ def train_table(
         network = load_network(weights, configs[name].network)
         figures = _measure(weights, network, configs[name]) if first else {}
         rows.append(
-            TableRow(name, figures, count_parameters(network), count_multiply_adds(network, network.card.input_size))
+            TableRow(
+                name,
+                network.tasks,
+                figures,
+                count_parameters(network),
+                count_multiply_adds(network, network.card.input_size),
+            )
         )
-    return TableResult(title, tuple(rows), len(rows) == len(recipes), first)
+    whole = TableResult(plan.title, tuple(rows), len(rows) == len(recipes), plan.compare, plan.tick_tasks, first)
+    if first:
+        write_file(printed, whole.summary() + "\n")
+    return whole
 
 
 def _measure(weights: Path, network: TriLiteNet, config: TrainConfig) -> dict[str, float]:
@@ -232,14 +268,33 @@ def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _read(table: Path) -> tuple[str, dict[str, Path]]:
-    content = read_yaml(table)
+@dataclasses.dataclass(frozen=True)
+class _Table:
+    """What a table's file says."""
+
+    title: str
+    recipes: dict[str, Path]
+    compare: str | None
+    tick_tasks: bool
+
+
+def _read(path: Path) -> _Table:
+    content = read_yaml(path)
+    known = ("title", "rows", "compare", "tick_tasks")
+    for key in content:
+        if key not in known:
+            raise ConfigError(f"{path}: unknown key {key!r}{did_you_mean(str(key), known)}")
     try:
-        rows = {str(name): table.parent / str(recipe) for name, recipe in content["rows"].items()}
+        rows = {str(name): path.parent / str(recipe) for name, recipe in content["rows"].items()}
         title = str(content["title"])
     except (KeyError, TypeError, AttributeError) as error:
-        raise ConfigError(f"{table}: must hold a title and rows of 'name: recipe' ({brief(error)})") from error
+        raise ConfigError(f"{path}: must hold a title and rows of 'name: recipe' ({brief(error)})") from error
     twice = [stem for stem, count in Counter(recipe.stem for recipe in rows.values()).items() if count > 1]
     if twice:
-        raise ConfigError(f"{table}: two recipes are called {twice[0]!r}, and would share a folder; rename one")
-    return title, rows
+        raise ConfigError(f"{path}: two recipes are called {twice[0]!r}, and would share a folder; rename one")
+    compare, tick_tasks = content.get("compare"), content.get("tick_tasks", False)
+    if compare is not None and str(compare) not in rows:
+        raise ConfigError(f"{path}: compare names no row{did_you_mean(str(compare), rows)}")
+    if not isinstance(tick_tasks, bool):
+        raise ConfigError(f"{path}: tick_tasks must be true or false, got {shown(tick_tasks)}")
+    return _Table(title, rows, None if compare is None else str(compare), tick_tasks)

@@ -2,25 +2,38 @@
 
 from __future__ import annotations
 
+import abc
 import contextlib
 import csv
+import json
+import logging
 import threading
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, Literal, Protocol, TypeAlias
 
 from trilitenet.data.description import folder_name
-from trilitenet.errors import import_extra, replacing
+from trilitenet.errors import TrainingError, TriLiteNetError, gist, import_extra, replacing, write_file
 
 __all__ = [
     "CsvLogger",
     "MLflowLogger",
+    "RunEnd",
     "RunLogger",
     "TensorBoardLogger",
     "WandbLogger",
     "build_loggers",
     "check_loggers",
 ]
+
+_LOGGER: Final = logging.getLogger(__name__)
+
+RunEnd: TypeAlias = Literal["finished", "stopped", "failed"]
+"""How a run ends."""
+
+_PAUSE: Final = 10.0
+"""Times as long as a try took that failed, a server is not tried again: one that is away slows a run by a tenth."""
 
 
 class RunLogger(Protocol):
@@ -29,7 +42,7 @@ class RunLogger(Protocol):
     def log(self, values: Mapping[str, float], step: int) -> None:
         """Take named figures of a step."""
 
-    def close(self) -> None:
+    def close(self, end: RunEnd = "finished") -> None:
         """Write out what is left."""
 
 
@@ -57,7 +70,7 @@ class CsvLogger:
         self._writer.writerows((step, name, repr(float(value))) for name, value in values.items())
         self._file.flush()
 
-    def close(self) -> None:
+    def close(self, end: RunEnd = "finished") -> None:
         """Close the file."""
         self._file.close()
 
@@ -92,7 +105,7 @@ class TensorBoardLogger:
         for name, value in values.items():
             self._writer.add_scalar(name, value, step)
 
-    def close(self) -> None:
+    def close(self, end: RunEnd = "finished") -> None:
         """Write out what is left."""
         try:
             self._writer.close()
@@ -106,37 +119,101 @@ class TensorBoardLogger:
             self._hook(failure)
 
 
-class MLflowLogger:
-    """An MLflow run, at the tracking server that MLFLOW_TRACKING_URI names."""
+class _ServerLogger(abc.ABC):
+    """Tells a server, of whose errors none ends a run that has begun: the first is warned of.
 
-    def __init__(self, name: str, config: Mapping[str, Any]) -> None:
+    Attributes:
+        run_id: What the server knows the run by.
+    """
+
+    run_id: str
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._warned = False
+        self._again = 0.0
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        """Take named figures of a step."""
+        if time.monotonic() >= self._again:
+            self._try(lambda: self._log(dict(values), step))
+
+    def close(self, end: RunEnd = "finished") -> None:
+        """End the run."""
+        self._try(lambda: self._close(end))
+
+    def _try(self, tell: Callable[[], None]) -> None:
+        began = time.monotonic()
+        try:
+            tell()
+        except Exception as error:  # what these packages raise shares no base class
+            now = time.monotonic()
+            self._again = now + _PAUSE * (now - began)
+            if not self._warned:
+                self._warned = True
+                reason = gist(error) or type(error).__name__
+                _LOGGER.warning("%s: cannot log (%s); the run goes on, and may miss figures there", self._name, reason)
+
+    @abc.abstractmethod
+    def _log(self, values: dict[str, float], step: int) -> None: ...
+
+    @abc.abstractmethod
+    def _close(self, end: RunEnd) -> None: ...
+
+
+class MLflowLogger(_ServerLogger):
+    """An MLflow run, at the tracking server that MLFLOW_TRACKING_URI names.
+
+    Args:
+        name: Of the run.
+        config: The resolved configuration.
+        run_id: Of the server's run to go on with; None begins one.
+    """
+
+    def __init__(self, name: str, config: Mapping[str, Any], run_id: str | None = None) -> None:
+        super().__init__("mlflow")
         self._mlflow: Any = import_extra(*_PACKAGES["mlflow"])
-        self._mlflow.start_run(run_name=name)
-        self._mlflow.log_params({key: str(value)[:250] for key, value in config.items()})
+        self.run_id = self._mlflow.start_run(run_id=run_id, run_name=name).info.run_id
+        if run_id is None:  # it lets no parameter be changed
+            self._try(lambda: self._mlflow.log_params({key: str(value)[:250] for key, value in config.items()}))
 
-    def log(self, values: Mapping[str, float], step: int) -> None:
-        """Take named figures of a step."""
-        self._mlflow.log_metrics(dict(values), step=step)
+    def _log(self, values: dict[str, float], step: int) -> None:
+        self._mlflow.log_metrics(values, step=step)
 
-    def close(self) -> None:
-        """End the run."""
-        self._mlflow.end_run()
+    def _close(self, end: RunEnd) -> None:
+        self._mlflow.end_run({"finished": "FINISHED", "stopped": "KILLED", "failed": "FAILED"}[end])
 
 
-class WandbLogger:
-    """A Weights & Biases run; WANDB_MODE=offline keeps it on this machine."""
+class WandbLogger(_ServerLogger):
+    """A Weights & Biases run; WANDB_MODE=offline keeps it on this machine.
 
-    def __init__(self, name: str, config: Mapping[str, Any], folder: Path) -> None:
+    Args:
+        name: Of the run.
+        config: The resolved configuration.
+        folder: Where its files go; there is one.
+        run_id: Of the server's run to go on with; None begins one.
+    """
+
+    def __init__(self, name: str, config: Mapping[str, Any], folder: Path, run_id: str | None = None) -> None:
+        super().__init__("wandb")
         wandb: Any = import_extra(*_PACKAGES["wandb"])
-        self._run = wandb.init(project="trilitenet", name=name, config=dict(config), dir=str(folder))
+        self._run = wandb.init(
+            project="trilitenet",
+            name=name,
+            config=dict(config),
+            dir=str(folder),
+            id=run_id,
+            resume=None if run_id is None else "allow",
+        )
+        self.run_id = self._run.id
+        # It would leave out a figure of a step before its own latest one, as of a validation that is done anew.
+        self._run.define_metric("*", step_metric="step")
 
-    def log(self, values: Mapping[str, float], step: int) -> None:
-        """Take named figures of a step."""
-        self._run.log(dict(values), step=step)
+    def _log(self, values: dict[str, float], step: int) -> None:
+        self._run.log({**values, "step": step})
 
-    def close(self) -> None:
-        """End the run."""
-        self._run.finish()
+    def _close(self, end: RunEnd) -> None:
+        self._run.finish(exit_code={"finished": 0, "stopped": 130, "failed": 1}[end])
 
 
 _PACKAGES: Final = {
@@ -145,6 +222,9 @@ _PACKAGES: Final = {
     "wandb": ("wandb", "wandb"),
 }
 """What a logger needs, and the extra that installs it."""
+
+_SERVERS: Final = {"mlflow": "MLFLOW_TRACKING_URI", "wandb": "`wandb login` and WANDB_MODE"}
+"""Loggers that tell a server, and what says which one and who one is."""
 
 
 def check_loggers(names: Sequence[str]) -> None:
@@ -159,7 +239,12 @@ def check_loggers(names: Sequence[str]) -> None:
 
 
 def build_loggers(
-    names: Sequence[str], folder: Path, config: Mapping[str, Any], step: int = 0, validated: int = 0
+    names: Sequence[str],
+    folder: Path,
+    config: Mapping[str, Any],
+    step: int = 0,
+    validated: int = 0,
+    begin: Callable[[], None] = lambda: None,
 ) -> list[RunLogger]:
     """Build loggers by name.
 
@@ -169,18 +254,58 @@ def build_loggers(
         config: The resolved configuration.
         step: Step the run goes on from.
         validated: Step of the last validation that it does not do anew.
+        begin: Is called once servers have let the run in, and before any file is made.
 
     Raises:
         MissingExtraError: If a logger's package is not installed.
+        TrainingError: If a server does not let the run in.
     """
-    loggers: list[RunLogger] = []
-    for name in dict.fromkeys(names):
-        if name == "csv":
-            loggers.append(CsvLogger(folder / "metrics.csv", step, validated))
-        elif name == "tensorboard":
-            loggers.append(TensorBoardLogger(folder / "tensorboard", step))
-        elif name == "mlflow":
-            loggers.append(MLflowLogger(folder_name(folder), config))
-        elif name == "wandb":
-            loggers.append(WandbLogger(folder_name(folder), config, folder))
-    return loggers
+    path = folder / "loggers.json"
+    known = _read_run_ids(path) if step else {}
+    servers: dict[str, _ServerLogger] = {}
+    files: list[RunLogger] = []
+    with contextlib.ExitStack() as opened:
+        for name in dict.fromkeys(names):
+            if name in _SERVERS:
+                servers[name] = _let_in(name, folder, config, known.get(name))
+                opened.callback(servers[name].close, "failed")
+        begin()
+        if servers:
+            ids = known | {name: server.run_id for name, server in servers.items()}
+            write_file(path, json.dumps(ids, indent=2) + "\n")
+        for name in dict.fromkeys(names):
+            if name == "csv":
+                files.append(CsvLogger(folder / "metrics.csv", step, validated))
+            elif name == "tensorboard":
+                files.append(TensorBoardLogger(folder / "tensorboard", step))
+        opened.pop_all()
+    return [*files, *servers.values()]
+
+
+def _let_in(name: str, folder: Path, config: Mapping[str, Any], run_id: str | None) -> _ServerLogger:
+    """Begin a run at a server, or go on with one.
+
+    Raises:
+        TrainingError: If the server does not let it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)  # wandb would take another
+    try:
+        if name == "mlflow":
+            return MLflowLogger(folder_name(folder), config, run_id)
+        return WandbLogger(folder_name(folder), config, folder, run_id)
+    except TriLiteNetError:
+        raise
+    except Exception as error:  # what these packages raise shares no base class
+        anew = "" if run_id is None else f"remove {folder / 'loggers.json'} to begin another run there, "
+        reason = gist(error) or type(error).__name__
+        raise TrainingError(
+            f"{name}: cannot log ({reason}); see {_SERVERS[name]}, {anew}or leave it out of --loggers"
+        ) from error
+
+
+def _read_run_ids(path: Path) -> dict[str, str]:
+    """Return what servers know a run by, by logger; nothing of a file that is not there or damaged."""
+    with contextlib.suppress(FileNotFoundError, ValueError):
+        ids = json.loads(path.read_text(encoding="utf-8"))
+        return ids if isinstance(ids, dict) else {}
+    return {}

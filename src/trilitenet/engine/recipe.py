@@ -8,14 +8,27 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from trilitenet.config import TASKS, Anchors, Task, check_anchors, check_tasks, get_variant, parse, plain, read_yaml
+from trilitenet.config import (
+    TASKS,
+    Anchors,
+    Task,
+    check_anchors,
+    check_size,
+    check_tasks,
+    get_variant,
+    parse,
+    plain,
+    read_yaml,
+)
 from trilitenet.data.transforms import Augmentation
-from trilitenet.errors import ConfigError
+from trilitenet.errors import ConfigError, shown
 
 __all__ = ["BASE_KEY", "TrainConfig", "merge", "read_recipe"]
 
 BASE_KEY: Final = "base"
 """Key of a recipe that names another one, relative to it, whose values it takes over."""
+_FORMS: Final = {"extra_data": "{OWN: 2, SCENES: 0.5}", "sampling": "{timeofday: {night: 2}}"}
+"""Settings that are mappings -> how one is written."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,9 +36,12 @@ class TrainConfig:
     """A training run. The defaults are the package's own recipe; those that depart from the publication say so.
 
     Attributes:
-        data: Root folder of a data set in the published layout.
-        extra_data: Root folders of further data sets to train on, each with the weight its images are drawn by; {} for
-            none.
+        data: Root folder of a data set in the published layout, or the folder or address (https://...) of a prepared
+            one.
+        extra_data: Further data sets to train on, each with the weight its images are drawn by, where those of ``data``
+            weigh 1, for example {OWN: 2, SCENES: 0.5}; {} for none.
+        cache: Folder for copies of prepared data sets at an address; trilitenet in the user's cache (~/.cache) if left
+            out.
         train_split: Split to train on.
         val_split: Split to validate on; empty for none.
         classes: Names of the detection classes; those of the data set if left out.
@@ -88,7 +104,7 @@ class TrainConfig:
         device: auto, cpu, cuda or mps.
         devices: Processes on this machine, a device each (more than one: distributed data-parallel).
         num_nodes: Machines, each with ``devices`` processes (start them with torchrun or SLURM).
-        precision: 32-true, bf16-mixed or 16-mixed; auto = bf16-mixed where the processor has it.
+        precision: 32-true, bf16-mixed or, on a GPU, 16-mixed; auto = bf16-mixed where the processor has it.
         compile: Compile the network (slow start, faster steps; needs a C++ compiler on a CPU).
         workers: Processes that read data ahead.
         max_steps: Stop after so many optimiser steps; 0 for no limit.
@@ -96,6 +112,7 @@ class TrainConfig:
 
     data: str = ""
     extra_data: dict[str, float] = dataclasses.field(default_factory=dict)
+    cache: str | None = None
     train_split: str = "train"
     val_split: str = "val"
     classes: tuple[str, ...] | None = None
@@ -159,6 +176,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         get_variant(self.variant)
+        check_size(self.input_size, "input_size")
         positive = ("epochs", "batch_size", "accumulate", "validate_every", "checkpoint_every", "log_every")
         for name in (*positive, "devices", "num_nodes"):
             if getattr(self, name) < 1:
@@ -178,6 +196,10 @@ class TrainConfig:
         ):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ConfigError(f"{name} must not be negative or infinite, got {getattr(self, name)}")
+        if self.samples_per_epoch is not None and self.samples_per_epoch < 1:
+            raise ConfigError(
+                f"samples_per_epoch must be at least 1, got {self.samples_per_epoch}; leave it out for all images"
+            )
         if self.seed >= 2**63:
             raise ConfigError(f"seed must be below 2**63, got {self.seed}")
         if self.batch_size % self.accumulate:
@@ -236,7 +258,14 @@ def read_recipe(path: str | Path | None, overrides: Mapping[str, Any] | None = N
     """
     mapping = _read(Path(path), ()) if path is not None else {}
     source = str(path) if path is not None else "train"
-    return parse(TrainConfig, merge(mapping, overrides or {}), source)
+    settings = merge(mapping, overrides or {})
+    for key, form in _FORMS.items():
+        value = settings.get(key, {})
+        if not isinstance(value, Mapping) or None in value.values():
+            raise ConfigError(
+                f"{source}: {key} is written like {form}, in quotes on the command line, got {shown(value)}"
+            )
+    return parse(TrainConfig, settings, source)
 
 
 def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:

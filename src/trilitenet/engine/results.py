@@ -92,7 +92,7 @@ def write_results(
 def _plot(curves: Mapping[str, tuple[list[int], list[float]]], *, log: bool) -> bytes:
     """Return a PNG."""
     module: Any = import_extra("matplotlib.figure", "train")
-    if log:  # of a term that is 0 throughout, as of a task that is not trained, there is nothing to see
+    if log:  # of a term that is 0 throughout, as of a task without labels, there is nothing to see
         curves = {
             name: (steps, values)
             for name, (steps, values) in curves.items()

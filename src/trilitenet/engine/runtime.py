@@ -21,7 +21,7 @@ from trilitenet.errors import BackendError, ConfigError, TrainingError, TriLiteN
 from trilitenet.processing.cores import usable_cores
 from trilitenet.processing.memory import STEPS, keep_freed_memory
 
-__all__ = ["StopRequest", "follow", "pick_precision", "putting_off", "running_fabric"]
+__all__ = ["StopRequest", "follow", "hosts_group", "pick_precision", "putting_off", "running_fabric"]
 
 _LOGGER: Final = logging.getLogger(__name__)
 
@@ -140,6 +140,8 @@ def _build_fabric(device: str, precision: str, devices: int, num_nodes: int) -> 
         accelerator = "cuda" if torch.cuda.is_available() else "cpu"
     if accelerator == "cpu":
         keep_freed_memory(STEPS)
+        if precision == "16-mixed":  # Lightning would compute in bf16, and say so in words of its own
+            raise ConfigError("precision 16-mixed is for GPUs; on a CPU use bf16-mixed or 32-true")
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     settings: dict[str, Any] = {"devices": devices, "num_nodes": num_nodes}
     if devices != 1 or num_nodes != 1:
@@ -261,6 +263,27 @@ def _tell(message: str) -> bool:
     except (RuntimeError, ValueError):
         return False
     return True
+
+
+def hosts_group(fabric: Any) -> Any:
+    """Return the group by which the processes' hosts exchange what no device has to wait for.
+
+    All processes call it together. None is the default group: of a single process, or on a CPU.
+
+    Raises:
+        TrainingError: If they cannot reach each other.
+    """
+    if fabric.world_size == 1 or fabric.device.type == "cpu":
+        return None
+    try:
+        return torch.distributed.new_group(backend="gloo", timeout=_PATIENCE)
+    except RuntimeError as error:
+        if isinstance(error, torch.distributed.DistError):  # the first process, where they meet, has gone
+            raise
+        raise TrainingError(
+            f"the processes cannot reach each other from host to host ({gist(error)}); "
+            "set GLOO_SOCKET_IFNAME to the network interface that their machines share"
+        ) from error
 
 
 def follow() -> None:

@@ -16,18 +16,18 @@ import torch
 import yaml
 from torch import Tensor, nn
 
-from trilitenet.config import TASKS, ModelCard
+from trilitenet.config import TASKS, ModelCard, Task
 from trilitenet.data.batches import Batch
 from trilitenet.data.identity import tell_apart
 from trilitenet.data.loader import WORKER_LOST
 from trilitenet.engine.checkpoint import random_state, read_checkpoint, set_random_state, write_checkpoint
 from trilitenet.engine.ema import MovingAverage
 from trilitenet.engine.guard import FiniteGuard
-from trilitenet.engine.loggers import RunLogger
+from trilitenet.engine.loggers import RunEnd, RunLogger
 from trilitenet.engine.optim import Schedule, build_optimiser
 from trilitenet.engine.recipe import TrainConfig
 from trilitenet.engine.rescale import draw_size, rescale
-from trilitenet.engine.runtime import StopRequest, putting_off
+from trilitenet.engine.runtime import StopRequest, hosts_group, putting_off
 from trilitenet.engine.transfer import keep_frozen
 from trilitenet.errors import (
     ConfigError,
@@ -41,7 +41,7 @@ from trilitenet.errors import (
     writing,
 )
 from trilitenet.losses.distillation import DistillationLoss
-from trilitenet.losses.multitask import LossTerms, MultiTaskLoss
+from trilitenet.losses.multitask import MultiTaskLoss
 from trilitenet.models.trilitenet import TriLiteNet, normalise_images
 from trilitenet.models.weights import read_card, save_network
 from trilitenet.processing.memory import lacks_memory
@@ -53,10 +53,17 @@ CHECKPOINT_NAME: Final = "last.ckpt"
 """The checkpoint in the run's folder that `--resume` continues from."""
 
 _RESULTS: Final = (CHECKPOINT_NAME, "final.safetensors", "best-*.safetensors")
-_TRACES: Final = ("config.yaml", "metrics.csv", "results", "tensorboard")
+_TRACES: Final = ("config.yaml", "metrics.csv", "loggers.json", "results", "tensorboard")
 
 FIGURES: Final = {"detection": "detection/ap50", "drivable": "drivable/miou", "lane": "lane/iou"}
 """The figure each task is judged by; the mean of these is the overall one."""
+
+_TERMS: Final[Mapping[Task, tuple[str, ...]]] = {
+    "detection": ("box", "objectness", "classification"),
+    "drivable": ("drivable_focal", "drivable_tversky"),
+    "lane": ("lane_focal", "lane_tversky"),
+}
+"""Each task's part of `trilitenet.losses.multitask.LossTerms`."""
 
 SAME_ON_RESUME: Final = (
     "variant",
@@ -198,6 +205,7 @@ class Trainer:
         self.display = display
         self.folder = Path(config.output)
         self.loggers: Sequence[RunLogger] = ()
+        self._hosts = hosts_group(fabric)
 
         self.network = network.to(fabric.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         loss = loss.to(fabric.device)
@@ -211,10 +219,14 @@ class Trainer:
         compiled = torch.compile(self.network) if config.compile else self.network
         self.model, self.optimiser = fabric.setup(_FromPixels(compiled, card), optimiser)
         self.loss = loss
+        self.terms = ["total", *(name for task in network.tasks for name in _TERMS[task])]
+        """Names of the losses that are told: of the tasks that there are, and of what is distilled."""
         self.teacher = None
         if teacher is not None:
             tutor = teacher[0].to(fabric.device).eval()
             self.teacher = _FromPixels(tutor, tutor.card), teacher[1].to(fabric.device).eval()
+            weights = dict(zip(TASKS, teacher[1].weights, strict=True))
+            self.terms += [f"distil_{task}" for task in network.tasks if task in tutor.tasks and weights[task]]
         self.ema = MovingAverage(self.network, config.ema_decay, config.ema_ramp) if config.ema_decay else None
         interval = 20 if fabric.device.type == "cuda" else 1
         # The average follows no bad step that is seen at once.
@@ -252,40 +264,32 @@ class Trainer:
 
     def fit(
         self,
-        resume: str | Path | None = None,
-        build_loggers: Callable[[int, int], Sequence[RunLogger]] = lambda step, validated: (),
+        resume: str | Path | None,
+        build_loggers: Callable[[int, int, Callable[[], None]], Sequence[RunLogger]],
     ) -> TrainResult:
         """Train to the end, or until SIGINT or SIGTERM asks to stop.
 
         Args:
             resume: A checkpoint to go on from.
             build_loggers: Returns the loggers of a run that goes on from a step, the last validation that it will not
-                do anew being of another one.
+                do anew being of another one. It is to call its third argument, which removes an earlier run, when a
+                server cannot refuse it any more, and before it makes a file.
 
         Raises:
             DataError: If an image or label cannot be read.
             OutputError: If a result cannot be written.
-            TrainingError: If the loss or gradient is not finite ten steps in a row, the device is out of memory, or a
-                process that reads images was killed.
+            TrainingError: If the loss or gradient is not finite ten steps in a row, the device is out of memory, a
+                process that reads images was killed, or the server of a logger does not let the run in.
             WeightsError: If the checkpoint is damaged or of another run.
         """
         if resume is not None:
             self.load(resume)
         if self.fabric.is_global_zero:
             with writing(self.folder):
-                for name in (*_RESULTS, *_TRACES):
-                    for part in self.folder.glob(f".{name}.*.part"):  # of a run that was killed while it wrote
-                        part.unlink()
-                if resume is None:
-                    _forget(self.folder)
-                write_file(self.folder / "config.yaml", yaml.safe_dump(self.config.to_dict(), sort_keys=False))
-                self.loggers = build_loggers(self.step, self.ended)
+                self.loggers = build_loggers(self.step, self.ended, lambda: self._begin(anew=resume is None))
         weights = self.folder / "final.safetensors"
         try:
-            with self._logging():
-                finished = self._run()
-            if finished and self.fabric.is_global_zero:
-                save_network(self.averaged, weights, self._card())
+            finished = self._run_to(weights)
         except (DataError, OutputError) as error:  # it came between two steps
             raise type(error)(f"{error}; once that is mended, {self._keep()}") from error
         except RuntimeError as error:
@@ -306,6 +310,29 @@ class Trainer:
         speed = self.images / self.seconds if self.seconds else 0.0
         first = self.fabric.is_global_zero
         return TrainResult(self.folder, weights, self.step, finished, self.metrics, self.best, speed, first)
+
+    def _begin(self, *, anew: bool) -> None:
+        """Write the settings into the folder, without what an earlier run left there or one that was killed cut off."""
+        for name in (*_RESULTS, *_TRACES):
+            for part in self.folder.glob(f".{name}.*.part"):
+                part.unlink()
+        if anew:
+            _forget(self.folder)
+        write_file(self.folder / "config.yaml", yaml.safe_dump(self.config.to_dict(), sort_keys=False))
+
+    def _run_to(self, weights: Path) -> bool:
+        """Run the epochs, write the weights of the end, and close the loggers; return whether the end was reached."""
+        try:
+            finished = self._run()
+            if finished and self.fabric.is_global_zero:
+                save_network(self.averaged, weights, self._card())
+        except BaseException as error:
+            with contextlib.suppress(OSError):  # of which what is told already may be the cause
+                self._close("stopped" if isinstance(error, KeyboardInterrupt) else "failed")
+            raise
+        with writing(self.folder):
+            self._close("finished" if finished else "stopped")
+        return finished
 
     def _run(self) -> bool:
         """Run the epochs; return whether the end was reached, by schedule or by early stopping."""
@@ -331,19 +358,11 @@ class Trainer:
         epoch = math.ceil(self._saved / self.epoch_steps)
         return f"--resume goes on after step {self._saved} of {self.steps} (epoch {epoch} of {self.config.epochs})"
 
-    @contextlib.contextmanager
-    def _logging(self) -> Iterator[None]:
-        """Close the loggers at the end."""
-        try:
-            yield
-        except BaseException:
-            for logger in self.loggers:
-                with contextlib.suppress(OSError):  # of which what is told already may be the cause
-                    logger.close()
-            raise
-        with writing(self.folder):
-            for logger in self.loggers:
-                logger.close()
+    def _close(self, end: RunEnd) -> None:
+        """Close all loggers, also where one cannot be."""
+        with contextlib.ExitStack() as closing:
+            for logger in reversed(self.loggers):
+                closing.callback(logger.close, end)
 
     @property
     def averaged(self) -> TriLiteNet:
@@ -357,7 +376,7 @@ class Trainer:
         self.model.train()
         keep_frozen(self.network, self.config.freeze)
         batches = self.loader.epoch(epoch, start=start * self.config.accumulate)
-        sums = torch.zeros(len(LossTerms._fields) + 1, device=self.fabric.device)
+        sums = torch.zeros(len(self.terms) + 1, device=self.fabric.device)
         rate, mark, since = 0.0, time.perf_counter(), 0
         while group := self._read(batches, stop):
             rate = self.schedule.apply(self.optimiser, self.step)
@@ -398,12 +417,12 @@ class Trainer:
 
     def _train_step(self, batches: Sequence[Batch]) -> Tensor:
         """Run one optimiser step; return the loss terms and 1, or zeros if it was left out."""
-        sums = torch.zeros(len(LossTerms._fields) + 1, device=self.fabric.device)
+        sums = torch.zeros(len(self.terms) + 1, device=self.fabric.device)
         for index, batch in enumerate(batches):
             with self.fabric.no_backward_sync(self.model, enabled=index < len(batches) - 1):
                 terms = self._losses(batch.to(self.fabric.device, non_blocking=True))
-                self.fabric.backward(terms.total / len(batches))
-            sums[:-1] += torch.stack([term.detach() for term in terms]) / len(batches)
+                self.fabric.backward(terms["total"] / len(batches))
+            sums[:-1] += torch.stack([terms[name].detach() for name in self.terms]) / len(batches)
         if self.fabric.world_size > 1:
             for parameter in self.loss.parameters():
                 parameter.grad = self.fabric.all_reduce(parameter.grad)
@@ -422,19 +441,21 @@ class Trainer:
         sums[-1] = 1
         return torch.where(torch.isfinite(sums[0]) & torch.isfinite(norm), sums, torch.zeros_like(sums))
 
-    def _losses(self, batch: Batch) -> LossTerms:
-        """Run the network on a batch."""
+    def _losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Run the network on a batch; return the terms of the loss by name."""
         if self.config.multi_scale is not None:
             size = (batch.images.shape[2], batch.images.shape[3])
             batch = rescale(batch, draw_size(size, self.config.multi_scale, self.config.seed, self.step))
         images = batch.images.contiguous(memory_format=torch.channels_last)
         outputs = self.model(images)
-        terms: LossTerms = self.loss(outputs, batch)
+        terms: dict[str, Tensor] = self.loss(outputs, batch)._asdict()
         if self.teacher:
             network, distil = self.teacher
             with torch.no_grad(), self.fabric.autocast():
                 lesson = network(images)
-            terms = terms._replace(total=terms.total + torch.stack(tuple(distil(outputs, lesson))).sum())
+            taught = distil(outputs, lesson)
+            terms["total"] = terms["total"] + torch.stack(tuple(taught)).sum()
+            terms |= {f"distil_{task}": term for task, term in taught._asdict().items()}
         return terms
 
     def _end_epoch(self, epoch: int, stop: StopRequest) -> None:
@@ -519,8 +540,9 @@ class Trainer:
         """Return of each thing whether it is so in any process."""
         if self.fabric.world_size == 1:
             return here
-        so = torch.tensor(here, dtype=torch.float32, device=self.fabric.device)
-        return tuple((self.fabric.all_reduce(so, reduce_op="sum") > 0).tolist())
+        so = torch.tensor(here, dtype=torch.float32)  # not on the device, whose steps a look would wait for
+        torch.distributed.all_reduce(so, group=self._hosts)
+        return tuple((so > 0).tolist())
 
     def _log_losses(self, epoch: int, sums: Tensor, rate: float, mark: float, since: int) -> None:
         """Log the mean losses of all processes, of so many images since a time, and clear the sums; all take part."""
@@ -530,13 +552,20 @@ class Trainer:
         whole = sums if self.fabric.world_size == 1 else self.fabric.all_reduce(sums.clone())
         *means, _ = (whole / whole[-1]).tolist()  # NaN where every step was left out
         sums.zero_()
-        losses = dict(zip(LossTerms._fields, means, strict=True))
-        figures = {f"train/{name}": value for name, value in losses.items()}
+        losses = dict(zip(self.terms, means, strict=True))
+        figures = {f"train/{name}": value for name, value in (losses | self._balance()).items()}
         self._tell(figures | {"lr": rate, "images_per_second": speed})
         parts = " ".join(f"{name} {value:.4f}" for name, value in losses.items())
         text = f"epoch {epoch + 1}/{self.config.epochs} step {self.step}/{self.steps}: {parts} ({speed:.1f} images/s)"
         if self.display is not None and self.fabric.is_global_zero:
             self.display.step(self.step, self.steps, text)
+
+    def _balance(self) -> dict[str, float]:
+        """Return what multiplies each task's loss, where that is learned."""
+        if self.loss.log_variance is None:
+            return {}
+        learned = zip(TASKS, self.loss.weights, torch.exp(-self.loss.log_variance.detach()).tolist(), strict=True)
+        return {f"weight_{task}": weight * factor for task, weight, factor in learned if task in self.network.tasks}
 
     def _tell(self, values: Mapping[str, float]) -> None:
         with writing(self.folder):
@@ -669,12 +698,12 @@ class Trainer:
 
 
 def _changes(before: Mapping[str, Any], after: Mapping[str, Any], within: str = "") -> Iterator[str]:
-    """Tell every setting that has another value, but the places of data and run, which may have been moved."""
+    """Tell every setting that has another value, but the places of data, copies and run, which may have been moved."""
     for name, value in after.items():
         old = before.get(name, value)
         if isinstance(old, Mapping) and old.keys() == value.keys():
             yield from _changes(old, value, f"{within}{name}.")
-        elif old != value and name not in ("data", "output"):
+        elif old != value and name not in ("data", "cache", "output"):
             yield f"{within}{name} {value} (was {old})"
 
 
