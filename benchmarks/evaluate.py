@@ -87,7 +87,7 @@ def main() -> None:
             end = clock()
             alone.append([b - a for a, b in zip(start, middle, strict=True)])
             scored.append([b - a for a, b in zip(middle, end, strict=True)])
-        print(f"{arguments.model} ({model.backend.name}), {width}x{height}, {describe_hardware()}")
+        print(f"{arguments.model} ({model.backend.name}), {width}x{height}, {describe_hardware(model.backend.name)}")
         for which, name in enumerate(("clock", "processor")):
             first, second = ([1000 * row[which] / count for row in rows] for rows in (alone, scored))
             ratios = [after / before for before, after in zip(first, second, strict=True)]

@@ -187,7 +187,7 @@ def main() -> None:
     for _ in range(options.rounds):
         alone = pure_inference(predictor, batch, options.frames)
         rounds.append((alone, pipeline(predictor, options.video, options.frames, options.overlay, road)))
-    print(f"machine: {describe_hardware()}; {predictor.backend.name}")
+    print(f"machine: {describe_hardware(predictor.backend.name)}; {predictor.backend.name}")
     for alone, whole in rounds:
         print(f"pure inference {alone:7.1f} frames/s   pipeline {whole:7.1f} frames/s   ratio {whole / alone:.2f}")
     print(f"median ratio {statistics.median(whole / alone for alone, whole in rounds):.2f}")

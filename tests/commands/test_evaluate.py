@@ -206,8 +206,8 @@ def test_negative_counts_are_refused_before_the_work(
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"resolution": (96, 0)}, "at least 1, got 0"),
-        ({"resolution": (99999,)}, "at most 16384, got 99999"),
+        ({"resolution": (96, 0)}, "--resolution must be of 1 to 16384, got 96, 0"),
+        ({"resolution": (99999,)}, "--resolution must be of 1 to 16384, got 99999"),
         ({"corruptions": True, "severities": (3, 6)}, "--severities must be of 1 to 5, got 3, 6"),
         ({"corruptions": True, "severities": ()}, "--severities must be of 1 to 5, got none"),
         ({"batch_size": 0}, "--batch-size must be at least 1, got 0"),
@@ -265,7 +265,7 @@ def test_boxes_of_names_that_the_split_lacks_are_told(
     saved = tmp_path / "saved"
     saved.mkdir()
     names = DrivingDataset(data, "val").names
-    entry = {"category_id": 1, "bbox": [0, 0, 2, 2], "score": 0.5}
+    entry = {"category_id": 1, "bbox": [0, 0, 2, 2], "score": 0.2}
     entries = [entry | {"image_id": name} for name in (names[0], f"{names[1]}.jpg")]
     (saved / "detections.json").write_text(json.dumps(entries))
     score(saved, data=data, resamples=0, worst=0)
@@ -277,6 +277,53 @@ def test_boxes_of_names_that_the_split_lacks_are_told(
     (saved / "detections.json").write_text(json.dumps([entry | {"image_id": name} for name in names]))
     score(saved, data=data, resamples=0, worst=0)
     assert caplog.text == ""
+
+
+def test_predictions_that_were_cut_off_are_told(data: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for score_of, told in ((0.2504, False), (0.41, True)):
+        entry = {"category_id": 1, "bbox": [0, 0, 2, 2], "score": score_of}
+        entries = [entry | {"image_id": name} for name in DrivingDataset(data, "val").names]
+        (tmp_path / "detections.json").write_text(json.dumps(entries))
+        score(tmp_path, data=data, resamples=0, worst=0)
+        message = "no box is below confidence 0.41, so precision, recall and F1 at 0.25 are undefined"
+        assert (message in caplog.text) == told
+
+
+def test_thresholds_that_decide_nothing_are_told(data: Path, weights: Path, caplog: pytest.LogCaptureFixture) -> None:
+    options: dict[str, Any] = {"confidence": 0.9, "lane": 0.95}
+    for protocol in ("fair", "both"):
+        evaluate(weights, data=data, protocol=protocol, limit=1, resamples=0, worst=0, **options)
+    evaluate(weights, data=data, protocol="paper", limit=1, resamples=0)
+    assert not caplog.records
+    report = evaluate(weights, data=data, protocol="paper", limit=1, resamples=0, **options)
+    (record,) = caplog.records
+    assert record.message == (
+        "no figure of --protocol paper hangs on --confidence, --lane: it goes by confidence 0.001, IoU 0.6 and the "
+        "likelier class"
+    )
+    assert report.provenance.thresholds["lane"] == 0.95  # by which a report is known again
+    assert report.provenance.settings["paper_thresholds"]["lane"] == 0.5
+
+
+def test_tasks_without_a_labelled_image_are_told_once(
+    run: tuple[Report, Path], data: Path, weights: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = shutil.copytree(data, tmp_path / "data")
+    (root / "ll_seg_annotations").rename(root / "ll_annotations")
+    (root / "det_annotations" / "val").rename(root / "det_annotations" / "test")
+    message = (
+        f"no image of {root} val is labelled for detection, lane: nothing in {root / 'det_annotations' / 'val'}, "
+        f"{root / 'll_seg_annotations' / 'val'}"
+    )
+    evaluate(weights, data=root, resamples=0, worst=0)
+    assert [record.message for record in caplog.records] == [message]
+    caplog.clear()
+    score(run[1] / "predictions", data=root, resamples=0, worst=0)
+    assert [record.message for record in caplog.records] == [message]
+    caplog.clear()
+    (root / "dataset.yaml").write_text("tasks: [drivable]\n")
+    evaluate(weights, data=root, resamples=0, worst=0)
+    assert not caplog.records
 
 
 def test_data_of_other_classes_are_told(

@@ -38,6 +38,7 @@ def test_what_is_written_is_read_again(tmp_path: Path, rng: np.random.Generator)
     saved = SavedPredictions(tmp_path, ("car", "bus"))
     assert saved.tasks == ("detection", "drivable", "lane")
     assert saved.names == {"image 1", "image 2", "image 3"}  # the first has no boxes
+    assert saved.lowest == pytest.approx(min(one.boxes.confidence[-1] for one in written.values() if one.boxes))
     for name, one in written.items():
         again = saved.get(name, (40, 50))
         assert again.boxes is not None

@@ -134,7 +134,8 @@ def test_one_weight_an_image_is_repeating_the_image(rng: np.random.Generator) ->
     )
     weighted = metric.figures(counts[None].astype(np.float64))
     for name, value in repeated.figures().items():
-        assert weighted[name][0] == pytest.approx(value[0], abs=1e-12), name
+        if not name.endswith("_best"):  # the best confidence is of all images once
+            assert weighted[name][0] == pytest.approx(value[0], abs=1e-12), name
 
 
 def test_a_small_case_by_hand() -> None:
@@ -153,6 +154,39 @@ def test_a_small_case_by_hand() -> None:
     assert scores.best.confidence == pytest.approx(0.2)
     assert scores.recall_all == 1.0
     assert metric.confusion.tolist() == [[2, 1], [1, 0]]
+
+
+def test_the_figures_at_every_stated_confidence_by_hand() -> None:
+    # As above, then an image whose box of 0.3 is wrong: best is still all down to 0.2, 6 / (5 + 4) against 4 / (3 + 4).
+    truth = np.array([[0, 0, 10, 10], [20, 0, 30, 10], [40, 0, 80, 40]], np.float32)
+    boxes = np.concatenate([truth[:1], [[60, 60, 70, 70]], truth[1:]]).astype(np.float32)
+    metric = DetectionMetric(confidence=0.7)
+    metric.update(boxes, np.array([0.9, 0.8, 0.6, 0.2]), np.zeros(4, np.int64), truth, np.zeros(3, np.int64))
+    metric.update(boxes[1:2], np.array([0.3]), np.zeros(1, np.int64), truth[:1], np.zeros(1, np.int64))
+    figures = {name: value.tolist() for name, value in metric.figures(np.array([[1, 1], [0, 1]])).items()}
+    assert figures["precision"] == pytest.approx([1 / 2, np.nan], nan_ok=True)
+    assert figures["recall"] == pytest.approx([1 / 4, 0])
+    assert figures["precision_best"] == pytest.approx([3 / 5, 0])
+    assert figures["recall_best"] == pytest.approx([3 / 4, 0])
+    assert figures["f1_best"] == pytest.approx([6 / 9, 0])
+    assert figures["precision_025"] == pytest.approx([2 / 4, 0])
+    assert figures["recall_025"] == pytest.approx([2 / 4, 0])
+    assert figures["f1_025"] == pytest.approx([4 / 8, 0])
+    assert figures["ap_medium"] == pytest.approx([1, np.nan], nan_ok=True)
+    assert 0 < figures["ap_small"][0] < 1
+    assert np.isnan(figures["ap_large"]).all()
+    best = metric.compute().best
+    assert best.f1 == pytest.approx(figures["f1_best"][0])
+    metric.update(boxes[:3], np.array([0.9, 0.8, 0.6]), np.zeros(3, np.int64), boxes[:3], np.zeros(3, np.int64))
+    assert metric.figures()["f1_best"][0] == pytest.approx(metric.compute().best.f1) != pytest.approx(best.f1)
+
+
+def test_what_boxes_that_were_cut_off_decide_is_undefined(rng: np.random.Generator) -> None:
+    for lowest, known in ((0.0, True), (0.255, True), (0.4, False)):
+        metric = fill(DetectionMetric(lowest=lowest), random_images(rng, 10, 1))
+        for one in (metric, DetectionMetric.from_state(json.loads(json.dumps(metric.state())))):
+            undefined = {name for name, value in one.figures().items() if np.isnan(value).any()}
+            assert undefined == (set() if known else {"precision_025", "recall_025", "f1_025"})
 
 
 def test_an_ignored_region_is_neither_object_nor_background() -> None:

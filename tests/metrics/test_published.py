@@ -238,3 +238,31 @@ def test_plain_empty_lists_are_no_boxes() -> None:
     metric.update([], [], [], [[0, 0, 10, 10]], [0])  # type: ignore[arg-type]
     metric.update([], [], [], [], [])  # type: ignore[arg-type]
     assert (metric.compute().objects, metric.compute().images) == (1, 2)
+
+
+def test_curve_and_histogram_count_every_box_by_the_published_matching(rng: np.random.Generator) -> None:
+    metric = PublishedDetection()
+    for _ in range(20):
+        low = rng.uniform(0, 60, (4, 2))
+        truth = np.concatenate([low, low + 20], axis=1)
+        boxes = np.concatenate([truth + rng.normal(0, 3, truth.shape), truth + 50])
+        metric.update(boxes, rng.integers(1, 9, 8) / 10, np.zeros(8, np.int64), truth, np.zeros(4, np.int64))
+    scores, curve = metric.compute(), metric.curve()
+    right, wrong = metric.histogram(10)
+    assert (right.sum() + wrong.sum(), right.sum()) == (scores.boxes, pytest.approx(scores.recall * scores.objects))
+    assert curve.recall[-1] == pytest.approx(scores.recall)
+    assert curve.precision[-1] == pytest.approx(scores.precision)
+    assert (np.diff(curve.confidence) < 0).all()
+    assert len(PublishedDetection().curve().confidence) == 0
+
+
+def test_pixels_are_counted_over_the_data_set() -> None:
+    metric = PublishedSegmentation(1)
+    mask = np.array([[1, 1, 0, 0]], np.uint8)
+    metric.update(mask, np.array([[1, 0, 0, 0]], np.uint8))
+    metric.update(mask, mask)
+    metric.update(mask, None)
+    scores = metric.compute()
+    counts = (scores.true_positive, scores.false_positive, scores.false_negative, scores.true_negative)
+    assert counts == (3, 1, 0, 4)
+    assert scores.dataset_iou == pytest.approx(3 / 4)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import logging
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -21,12 +22,14 @@ from trilitenet.engine.predictions import PredictionWriter
 from trilitenet.engine.provenance import hash_files
 from trilitenet.engine.report import Report, Variation, read_report
 from trilitenet.engine.robustness import corrupted_figures, figures_by_size
-from trilitenet.engine.scorecard import CONDITIONS, GROUP
+from trilitenet.engine.scorecard import CONDITIONS, GROUP, PAPER_THRESHOLDS
 from trilitenet.errors import ConfigError, DataError, OutputError
-from trilitenet.inference.predictor import Predictor
+from trilitenet.inference.predictor import LONGEST_SIDE, Predictor
 from trilitenet.processing.corruptions import SEVERITIES
 
-__all__ = ["evaluate", "hash_dataset", "hash_model", "known_report", "write_report"]
+__all__ = ["evaluate", "hash_dataset", "hash_model", "known_report", "warn_of_unlabelled", "write_report"]
+
+_LOGGER: Final = logging.getLogger(__name__)
 
 _PAPER_BATCH: Final = 16
 
@@ -105,6 +108,8 @@ def evaluate(
     if not severities or not set(severities) <= set(SEVERITIES):
         raise ConfigError(f"--severities must be of 1 to 5, got {', '.join(map(str, severities)) or 'none'}")
     check_output(output, overwrite)
+    if protocol == "paper":
+        _warn_of_thresholds({"confidence": confidence, "iou": iou, "drivable": drivable, "lane": lane})
     predictor = load(
         model,
         network=network,
@@ -121,6 +126,7 @@ def evaluate(
         resized = _resized(predictor, resolution)
         dataset = DrivingDataset(data, split, class_names=predictor.card.class_names)
         shown = stack.enter_context(show_progress("images"))
+        warn_of_unlabelled(dataset, predictor.card.tasks)
         if "detection" in predictor.card.tasks:
             dataset.warn_of_foreign(shown)
         writer = None
@@ -167,6 +173,27 @@ def evaluate(
     return report
 
 
+def _warn_of_thresholds(given: Mapping[str, float | None]) -> None:
+    """Warn of thresholds that were asked for and decide nothing."""
+    options = [f"--{name}" for name, value in given.items() if value is not None]
+    if options:
+        _LOGGER.warning(
+            "no figure of --protocol paper hangs on %s: it goes by confidence %g, IoU %g and the likelier class",
+            ", ".join(options), PAPER_THRESHOLDS.confidence, PAPER_THRESHOLDS.iou,
+        )  # fmt: skip
+
+
+def warn_of_unlabelled(dataset: DrivingDataset, tasks: Sequence[Task]) -> None:
+    """Warn of tasks that no image of the split is labelled for, unless ``dataset.yaml`` says so."""
+    without = [task for task in tasks if task in dataset.description.tasks and not dataset.has_labels(task)]
+    if without:
+        folders = ", ".join(str(dataset.label_path(task, "").parent) for task in without)
+        _LOGGER.warning(
+            "no image of %s %s is labelled for %s: nothing in %s", dataset.root, dataset.split, ", ".join(without),
+            folders,
+        )  # fmt: skip
+
+
 def _check_artefact(model: str, predictor: Predictor, protocol: str) -> None:
     """Refuse an artefact that has decided already what a protocol decides.
 
@@ -195,6 +222,8 @@ def _resized(predictor: Predictor, sides: Sequence[int]) -> dict[int, EvaluatedP
     Raises:
         ConfigError: If the input's size is fixed, or a side out of range.
     """
+    if not all(1 <= side <= LONGEST_SIDE for side in sides):
+        raise ConfigError(f"--resolution must be of 1 to {LONGEST_SIDE}, got {', '.join(map(str, sides))}")
     if sides and predictor.backend.canvas is not None:
         height, width = predictor.backend.canvas
         raise ConfigError(

@@ -7,7 +7,7 @@ from collections.abc import Sequence, Set
 from pathlib import Path
 from typing import Final, Literal
 
-from trilitenet.commands.evaluate import check_counts, check_output, hash_dataset, write_report
+from trilitenet.commands.evaluate import check_counts, check_output, hash_dataset, warn_of_unlabelled, write_report
 from trilitenet.commands.paths import StrPath, one_for_several, optional_path
 from trilitenet.commands.progress import show_progress
 from trilitenet.data.reading import DrivingDataset
@@ -17,6 +17,7 @@ from trilitenet.engine.provenance import hash_files
 from trilitenet.engine.report import Report
 from trilitenet.engine.scorecard import CONDITIONS, GROUP
 from trilitenet.errors import ConfigError, DataError
+from trilitenet.metrics.detection import COMMON_CONFIDENCE, COMMON_CUT
 
 __all__ = ["score"]
 
@@ -81,8 +82,14 @@ def score(
             f"{predictions}: predictions for none of the {len(dataset)} images "
             f"(such as {min(saved.names)!r}); image_id must be the name of the image without ending"
         )
+    warn_of_unlabelled(dataset, saved.tasks)
     if "detection" in saved.tasks:
         _warn_of_names(saved.names, dataset.names, limit)
+        if saved.lowest > COMMON_CUT:
+            _LOGGER.warning(
+                "%s: no box is below confidence %.2g, so precision, recall and F1 at %g are undefined; boxes that were "
+                "cut off are missing in average precision too", DETECTIONS_FILE, saved.lowest, COMMON_CONFIDENCE,
+            )  # fmt: skip
     with show_progress("images") as shown:
         if "detection" in saved.tasks:
             dataset.warn_of_foreign(shown)

@@ -17,8 +17,8 @@ from rich.text import Text
 from trilitenet.config import Task
 from trilitenet.engine.figures import HEADLINES, meaning
 from trilitenet.engine.page import escape, interval_plot, page, percent, section, table
-from trilitenet.engine.published_rows import PUBLISHED_ROWS, PublishedRow
-from trilitenet.engine.report import SAVED, Report, render, titled_table, without_nan
+from trilitenet.engine.published_rows import PAPER, PUBLISHED_ROWS, PublishedRow
+from trilitenet.engine.report import SAVED, Report, render, text_width, titled_table, without_nan
 from trilitenet.errors import ConfigError, write_file
 from trilitenet.metrics.bootstrap import bootstrap, interval
 
@@ -28,6 +28,10 @@ COMPARISON_SCHEMA: Final = 1
 """Version of the JSON of a comparison."""
 _LABELS: Final[dict[Task, str]] = {"detection": "boxes", "drivable": "drivable", "lane": "lane"}
 """What the hash of a task's labels is called."""
+_COSTS: Final = ("parameters, M", "multiply-adds, G")
+"""Columns of what published models cost."""
+_COSTS_WIDTH: Final = 110
+"""Text of fewer characters a line leaves them out."""
 FloatArray = NDArray[np.float64]
 
 
@@ -130,6 +134,13 @@ class Comparison:
         told = ", ".join(f"{name} {value:.3g}" for name, value in self.confidence.items())
         return f"detection precision, recall and F1 are stated at other confidences: {told}"
 
+    def published_note(self) -> str:
+        """Return which models cannot be set against published rows yet, and what to do about it."""
+        lacking = [name for name, row in self.figures.items() if not any(key.startswith("paper/") for key in row)]
+        if not lacking:
+            return ""
+        return f"{', '.join(lacking)}: evaluate with --protocol paper (or both) to stand beside published rows"
+
     def difference(self, name: str, key: str) -> Difference | None:
         """Return the difference of a model in a figure, if it could be told."""
         return next((one for one in self.differences if one.model == name and one.figure == key), None)
@@ -188,7 +199,7 @@ def compare_reports(
         confidence={
             name: report.provenance.thresholds["confidence"]
             for name, report in reports.items()
-            if "confidence" in report.provenance.thresholds and _measures(report, "detection")
+            if "confidence" in report.provenance.thresholds and "fair/detection/f1" in report.figures
         },
         published=PUBLISHED_ROWS if published else (),
         resamples=resamples,
@@ -256,7 +267,7 @@ def _figure_table(comparison: Comparison) -> Table:
             difference = comparison.difference(name, key)
             if difference is not None:
                 mark = "*" if difference.real else " "
-                value += f" ({_signed(difference.low)} to {_signed(difference.high)}){mark}"
+                value += f" ({_interval(difference)}){mark}"
             cells.append(value)
         shown.add_row(_label(key), *cells)
     return shown
@@ -268,20 +279,34 @@ def _published_table(comparison: Comparison) -> list[Table | Text]:
     shown.add_column("model")
     for key in keys:
         shown.add_column(_label(key).removeprefix("paper ").replace(" ", "\n", 1), justify="right")
-    shown.add_column("measured")
+    costs = len(_COSTS) if text_width() >= _COSTS_WIDTH else 0
+    for title in _COSTS[:costs]:
+        shown.add_column(title.replace(", ", "\n"), justify="right")
     for name in comparison.names:
         cells = [percent(comparison.figures[name].get(key)) for key in keys]
-        shown.add_row(name, *cells, f"here, {comparison.data[name]}", style="bold")
-    protocols = list(dict.fromkeys(row.protocol for row in comparison.published))
+        shown.add_row(name, *cells, *("-" * costs), style="bold")
+    sources = list(dict.fromkeys((row.source, row.protocol) for row in comparison.published))
     for row in comparison.published:
-        shown.add_row(row.name, *row.printed, f"[{protocols.index(row.protocol) + 1}]")
-    notes = "\n".join(f"[{number}] {protocol}" for number, protocol in enumerate(protocols, 1))
-    return [shown, Text(notes + "\n[1] and [2]: BDD100K validation split, 10,000 images")]
+        number = sources.index((row.source, row.protocol)) + 1
+        shown.add_row(f"{row.name} [{number}]", *row.printed, *row.printed_cost[:costs])
+    notes = [
+        f"measured here: {', '.join(f'{name} on {comparison.data[name]}' for name in comparison.names)}",
+        f"published: {PAPER}",
+        *(f"[{number}] {source}; {protocol}" for number, (source, protocol) in enumerate(sources, 1)),
+        comparison.published_note(),
+    ]
+    return [shown, Text("\n".join(filter(None, notes)))]
 
 
 def _label(key: str) -> str:
     protocol, task, _ = key.split("/")
     return f"{protocol} {task} {meaning(key).title}"
+
+
+def _interval(difference: Difference) -> str:
+    if difference.value == difference.low == difference.high == 0:
+        return "no difference"
+    return f"{_signed(difference.low)} to {_signed(difference.high)}"
 
 
 def _signed(value: float) -> str:
@@ -308,21 +333,26 @@ def _comparison_page(comparison: Comparison) -> str:
             else f'<p class="note">{escape(comparison.unpaired.get(name, "no difference to tell"))}</p>'
         )
         plots.append(f'<div class="card"><h3>{escape(name)} less {escape(names[0])}, points</h3>{body}</div>')
-    if note := comparison.confidence_note():
-        plots.append(f'<p class="note">{escape(note)}</p>')
-    plots += [
-        f'<p class="note">{escape(f"{name}: {reason}")}</p>'
-        for name, reason in comparison.unpaired.items()
-        if any(one.model == name for one in comparison.differences)
+    notes = [
+        comparison.confidence_note(),
+        *(
+            f"{name}: {reason}"
+            for name, reason in comparison.unpaired.items()
+            if any(one.model == name for one in comparison.differences)
+        ),
     ]
     if plots:
-        parts.append(section("Which differences are real", f'<div class="grid">{"".join(plots)}</div>'))
+        below = f'<p class="note">{"<br>".join(escape(note) for note in notes if note)}</p>' if any(notes) else ""
+        body = f'<div class="stack"><div class="grid">{"".join(plots)}</div>{below}</div>'
+        parts.append(section("Which differences are real", body))
     parts.append(section("Every figure", f'<div class="card">{_page_figures(comparison)}</div>', "Per cent."))
     if comparison.published:
         note = (
-            "Published rows are copied from the tables of the TriLiteNet paper (BDD100K validation, 10,000 images). "
+            f"Published rows are as printed in {PAPER}. "
             "Only figures of the paper protocol on the same images can be set against them."
         )
+        if lacking := comparison.published_note():
+            note += f" {lacking}."
         parts.append(section("Beside published rows", f'<div class="card">{_page_published(comparison)}</div>', note))
     return page("trilitenet: comparison", "\n".join(parts))
 
@@ -338,8 +368,10 @@ def _page_figures(comparison: Comparison) -> str:
             note = ""
             if one is not None:
                 value = f"<b>{value}</b>" if one.real else value
-                verdict = "real" if one.real else "may be chance"
-                note = f'<span class="note">{_signed(one.low)} to {_signed(one.high)}, {verdict}</span>'
+                told = _interval(one)
+                if one.value or one.low or one.high:
+                    told += ", real" if one.real else ", may be chance"
+                note = f'<span class="note">{told}</span>'
             cells += f'<td class="n">{value}{note}</td>'
         rows.append(f"<tr><td>{escape(_label(key))}</td>{cells}</tr>")
     return table(head, "".join(rows))
@@ -348,17 +380,19 @@ def _page_figures(comparison: Comparison) -> str:
 def _page_published(comparison: Comparison) -> str:
     keys = list(comparison.published[0].figures)
     head = "<th>model</th>" + "".join(
-        f'<th class="n">{escape(_label(key).removeprefix("paper "))}</th>' for key in keys
+        f'<th class="n">{escape(title)}</th>'
+        for title in (*(_label(key).removeprefix("paper ") for key in keys), *_COSTS)
     )
     rows = [
         f"<tr><td><b>{escape(name)}</b><span class=note>measured here, on {escape(comparison.data[name])}</span></td>"
         + "".join(f'<td class="n">{percent(comparison.figures[name].get(key))}</td>' for key in keys)
+        + '<td class="n">-</td>' * len(_COSTS)
         + "</tr>"
         for name in comparison.names
     ]
     rows += [
         f"<tr><td>{escape(row.name)}<span class=note>{escape(row.source)}; {escape(row.protocol)}</span></td>"
-        + "".join(f'<td class="n">{text}</td>' for text in row.printed)
+        + "".join(f'<td class="n">{text}</td>' for text in (*row.printed, *row.printed_cost))
         + "</tr>"
         for row in comparison.published
     ]

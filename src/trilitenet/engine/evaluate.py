@@ -178,7 +178,8 @@ def evaluate(
         "thresholds": dataclasses.asdict(predictor.thresholds),
         **(about or {}),
     }
-    return _report(scorecard, started, canvases, details, resamples, seed)
+    published = dataclasses.asdict(PAPER_THRESHOLDS)
+    return _report(scorecard, started, canvases, details, resamples, seed, LOWEST_CONFIDENCE, published)
 
 
 def score_predictions(
@@ -226,6 +227,7 @@ def score_predictions(
         predictions.tasks,
         protocol=protocol,
         confidence=confidence,
+        lowest=predictions.lowest,
         paper_batch=paper_batch,
         worst=worst,
         by=by,
@@ -251,7 +253,8 @@ def score_predictions(
         "thresholds": {"confidence": confidence},
         **(about or {}),
     }
-    return _report(scorecard, started, canvases, details, resamples, seed)
+    published = {"confidence": PAPER_THRESHOLDS.confidence, "max_boxes": PAPER_THRESHOLDS.max_boxes}
+    return _report(scorecard, started, canvases, details, resamples, seed, predictions.lowest, published)
 
 
 def _with_saved(sample: LabelledImage, predictions: SavedPredictions) -> tuple[LabelledImage, Perception]:
@@ -295,6 +298,8 @@ def _report(
     about: Mapping[str, Any],
     resamples: int,
     seed: int,
+    lowest: float,
+    published: Mapping[str, float],
 ) -> Report:
     """Return the report of what was scored, with what is known of the run: versions, hardware, time and memory.
 
@@ -305,15 +310,17 @@ def _report(
         about: Fields of `Provenance`.
         resamples: Bootstrap draws for the intervals.
         seed: Of the draws.
+        lowest: Confidence that boxes go down to.
+        published: Thresholds that the 'paper' protocol decides with.
     """
     settings: dict[str, Any] = {
         "protocols": list(scorecard.protocols),
-        "lowest_confidence": LOWEST_CONFIDENCE,
+        "lowest_confidence": round(lowest, 6),
         "resamples": resamples,
         "seed": seed,
     }
     if scorecard.paper is not None:
-        settings["paper_batch"] = scorecard.paper.batch_size
+        settings |= {"paper_batch": scorecard.paper.batch_size, "paper_thresholds": dict(published)}
     fields: dict[str, Any] = {
         "model_sha256": None,
         "data": "",
@@ -328,7 +335,7 @@ def _report(
             **fields,
             images=images,
             versions=describe_versions(),
-            hardware=describe_hardware(),
+            hardware=describe_hardware(fields["runtime"]),
             started=datetime.datetime.fromtimestamp(started, datetime.timezone.utc).isoformat(timespec="seconds"),
             seconds=round(time.time() - started, 3),
             peak_memory_mib=round(peak_memory(), 1),

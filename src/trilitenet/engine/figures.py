@@ -21,15 +21,27 @@ class FigureMeaning:
     formula: str
 
 
+_BEST = "confidence of best F1 over all images, kept in draws, IoU 0.5"
 _TOLERANT = "share of {} pixels within {} px of a {} one"
 
 FIGURES: Final[dict[str, FigureMeaning]] = {
     # fair
     "fair/detection/ap50": FigureMeaning("AP50", "101-point COCO average precision at IoU 0.5, mean over classes"),
     "fair/detection/ap": FigureMeaning("AP50:95", "mean of COCO AP over IoU 0.50, 0.55 ... 0.95"),
+    "fair/detection/ap_small": FigureMeaning("AP50:95, small", "of boxes up to 32 x 32 px"),
+    "fair/detection/ap_medium": FigureMeaning("AP50:95, medium", "of boxes from 32 x 32 to 96 x 96 px"),
+    "fair/detection/ap_large": FigureMeaning("AP50:95, large", "of boxes from 96 x 96 px"),
     "fair/detection/precision": FigureMeaning("precision", "right / (right + wrong) boxes, stated confidence, IoU 0.5"),
     "fair/detection/recall": FigureMeaning("recall", "right boxes / objects, stated confidence, IoU 0.5"),
     "fair/detection/f1": FigureMeaning("F1", "2PR / (P + R), stated confidence, IoU 0.5"),
+    "fair/detection/precision_best": FigureMeaning("precision, best F1", f"right / (right + wrong) boxes, {_BEST}"),
+    "fair/detection/recall_best": FigureMeaning("recall, best F1", f"right boxes / objects, {_BEST}"),
+    "fair/detection/f1_best": FigureMeaning("best F1", f"2PR / (P + R), {_BEST}"),
+    "fair/detection/precision_025": FigureMeaning(
+        "precision at 0.25", "right / (right + wrong) boxes, confidence 0.25, IoU 0.5"
+    ),
+    "fair/detection/recall_025": FigureMeaning("recall at 0.25", "right boxes / objects, confidence 0.25, IoU 0.5"),
+    "fair/detection/f1_025": FigureMeaning("F1 at 0.25", "2PR / (P + R), confidence 0.25, IoU 0.5"),
     "fair/drivable/miou": FigureMeaning("mIoU", "(IoU foreground + IoU background) / 2, one confusion matrix"),
     "fair/drivable/iou": FigureMeaning("IoU", "TP / (TP + FP + FN), one confusion matrix"),
     "fair/drivable/precision": FigureMeaning("precision", "TP / (TP + FP) pixels"),

@@ -181,6 +181,11 @@ class SavedPredictions:
         """Images that have boxes."""
         return self._boxes.keys()
 
+    @property
+    def lowest(self) -> float:
+        """The least confidence of all boxes, 0 without any: those below it may have been cut off."""
+        return min((float(boxes.confidence[-1]) for boxes in self._boxes.values()), default=0.0)
+
     def get(self, name: str, size: tuple[int, int], tasks: Sequence[Task] = TASKS) -> Perception:
         """Return the prediction for an image.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import platform
+import re
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,6 +20,8 @@ from trilitenet.processing.cores import processor, usable_cores
 __all__ = ["describe_hardware", "describe_versions", "hash_files", "peak_memory"]
 
 _RUNTIMES: Final = ("torch", "onnxruntime", "openvino", "ncnn", "executorch", "tensorrt")
+_NVIDIA: Final = Path("/proc/driver/nvidia/gpus")
+"""Where NVIDIA's driver tells of GPUs, on Linux."""
 
 
 def hash_files(paths: Iterable[Path]) -> str:
@@ -47,9 +50,27 @@ def describe_versions() -> dict[str, str]:
     return versions
 
 
-def describe_hardware() -> str:
-    """Return processor, cores that may be used, and system in a line."""
-    return f"{processor()[0]}, {usable_cores()} cores, {platform.system()}"
+def describe_hardware(runtime: str) -> str:
+    """Return processor, cores that may be used, system, and the GPU of a runtime on one, in a line.
+
+    Args:
+        runtime: The runtime and its device, such as ``"torch cuda:1"``.
+    """
+    on_gpu = re.search(r"cuda:?(\d*)", runtime)
+    gpu = None if on_gpu is None else _gpu(int(on_gpu[1] or 0))
+    return f"{processor()[0]}, {usable_cores()} cores, {platform.system()}" + (f", {gpu}" if gpu else "")
+
+
+def _gpu(index: int) -> str | None:
+    """Return the model of a GPU; of all there are where these differ and CUDA's order is not known; None if unknown."""
+    torch = sys.modules.get("torch")
+    if torch is not None and index < torch.cuda.device_count():
+        return str(torch.cuda.get_device_name(index))
+    models = []
+    for path in sorted(_NVIDIA.glob("*/information")):
+        found = re.search(r"^Model:\s*(.+?)\s*$", path.read_text(encoding="utf-8", errors="replace"), re.M)
+        models += [found[1]] if found else []
+    return " or ".join(dict.fromkeys(models)) or None
 
 
 def peak_memory() -> float:

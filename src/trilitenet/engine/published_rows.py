@@ -1,7 +1,6 @@
 """Published figures to stand beside one's own, as printed, each with where it stands and how it was measured.
 
-All from Che and Lam, "TriLiteNet: Lightweight Model for Multi-Task Visual Perception": the tables of comparison,
-of configurations and of precision levels. BDD100K validation split, 10,000 images.
+From the paper's tables of comparison, of configurations and of precision levels.
 """
 
 from __future__ import annotations
@@ -9,8 +8,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Final
 
-__all__ = ["PAPER_OWN", "PEERS", "PUBLISHED_ROWS", "PublishedRow"]
+__all__ = ["PAPER", "PAPER_OWN", "PEERS", "PUBLISHED_ROWS", "PublishedRow"]
 
+PAPER: Final = (
+    'Che and Lam, "TriLiteNet: Lightweight Model for Multi-Task Visual Perception"; '
+    "BDD100K validation split, 10,000 images"
+)
+"""Where all rows are from, and what they were measured on."""
 PAPER_OWN: Final = "paper: 640x384, averages over batches, Acc balanced, recall at confidence 0.001"
 """How the TriLiteNet rows were measured."""
 PEERS: Final = "as the paper prints it; each work's own evaluation, not repeated here; Acc balanced, says the paper"
@@ -60,8 +64,16 @@ class PublishedRow:
     @property
     def printed(self) -> list[str]:
         """The figures as the paper prints them, a dash where it has none."""
-        values = (self.recall, self.map50, self.miou, self.acc, self.iou)
-        return ["-" if value is None else f"{value:.2f}".removesuffix("0") for value in values]
+        return _printed(self.recall, self.map50, self.miou, self.acc, self.iou)
+
+    @property
+    def printed_cost(self) -> list[str]:
+        """Parameters and multiply-adds likewise."""
+        return _printed(self.parameters, self.multiply_adds)
+
+
+def _printed(*values: float | None) -> list[str]:
+    return ["-" if value is None else f"{value:.2f}".removesuffix("0") for value in values]
 
 
 _CONFIGURATIONS = "table of configurations"

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from trilitenet.config import Task, parse, parse_json
+from trilitenet.config import TASKS, Task, parse, parse_json
 from trilitenet.engine.figures import CONDITION_FIGURES, HEADLINES, meaning
 from trilitenet.engine.page import percent
 from trilitenet.engine.scoring import FairMetrics, FairScores, PaperMetrics, PaperScores
@@ -147,7 +147,8 @@ class DetectionPlots:
         confidence: Likewise.
         right: Right boxes by twentieths of confidence.
         wrong: Wrong boxes by twentieths of confidence.
-        confusion: Row truth, column prediction, at the stated confidence; the last of each is background.
+        confusion: Row truth, column prediction, at the stated confidence; the last of each is background. Empty where
+            'paper' was measured alone.
         class_names: Of rows and columns.
     """
 
@@ -172,11 +173,11 @@ class Provenance:
         split: Their split.
         images: How many.
         data_sha256: Of images, masks and boxes, apart.
-        thresholds: Decision thresholds.
-        settings: Further settings of the protocols.
+        thresholds: Decision thresholds of the model, by which 'fair' goes.
+        settings: Further settings of the protocols; ``paper_thresholds`` are those of 'paper', which are its own.
         canvas: Sizes of the network's input, "width x height".
         versions: Versions by package.
-        hardware: Processor, cores, system.
+        hardware: Processor, cores, system, and the GPU if the runtime is on one.
         started: ISO 8601, UTC.
         seconds: From the first image to the last figure.
         peak_memory_mib: Most memory held by the process.
@@ -247,6 +248,23 @@ class Report:
         """The protocols that were used."""
         return tuple(name for name, scores in (("fair", self.fair), ("paper", self.paper)) if scores is not None)
 
+    def thresholds(self) -> dict[str, str]:
+        """Return what each protocol decided with, in words; none for 'paper' in reports that do not tell."""
+        known = {"fair": self.provenance.thresholds, "paper": self.provenance.settings.get("paper_thresholds", {})}
+        return {
+            protocol: ", ".join(f"{name} {value:g}" for name, value in known[protocol].items())
+            for protocol in self.protocols
+            if known[protocol]
+        }
+
+    def task_scores(self) -> dict[Task, Any]:
+        """Return the scores a task, lanes as labelled: of 'fair', or of 'paper' where that was measured alone."""
+        scores = self.paper if self.fair is None else self.fair
+        found = {task: one for task in TASKS if (one := getattr(scores, task)) is not None}
+        if self.fair is not None and self.fair.lane is not None:
+            found["lane"] = self.fair.lane.as_labelled
+        return found
+
     def values(self) -> dict[str, float]:
         """Return the figures without their intervals."""
         return {key: figure.value for key, figure in self.figures.items()}
@@ -298,7 +316,7 @@ class Report:
 
     def summary(self) -> str:
         """Return the report as text for a terminal: every figure with its interval and formula, then conditions."""
-        tables: list[Table | Text] = [_provenance_text(self.provenance)]
+        tables: list[Table | Text] = [_provenance_text(self)]
         for protocol in self.protocols:
             tables.append(_figure_table(protocol, self.figures))
         if any(figure.low is not None for figure in self.figures.values()):
@@ -310,14 +328,18 @@ class Report:
         return render(tables)
 
 
+def text_width() -> int:
+    """Return how many characters a line of `render` may have."""
+    return max(shutil.get_terminal_size((110, 40)).columns, 80)
+
+
 def render(parts: list[Any]) -> str:
     """Render rich objects as text, coloured if standard output is a terminal; brackets in names are no markup.
 
     What is too long for a column of a table goes on in the next line: nothing is cut off.
     """
     buffer = io.StringIO()
-    terminal = sys.stdout.isatty()
-    width = max(shutil.get_terminal_size((110, 40)).columns, 80)
+    terminal, width = sys.stdout.isatty(), text_width()
     console = Console(file=buffer, force_terminal=terminal, width=width, highlight=False, markup=False, emoji=False)
     for part in parts:
         for column in part.columns if isinstance(part, Table) else ():
@@ -387,26 +409,26 @@ def _variation_tables(variations: tuple[Variation, ...]) -> list[Table]:
     return tables
 
 
-def _provenance_text(provenance: Provenance) -> Text:
+def _provenance_text(report: Report) -> Text:
+    provenance = report.provenance
     lines = [
         f"model  {provenance.model} ({provenance.runtime}, canvas {', '.join(provenance.canvas)})",
         f"data   {provenance.data} {provenance.split}, {provenance.images} images",
-        f"with   {', '.join(f'{name} {value:g}' for name, value in provenance.thresholds.items())}",
+        *(f"{protocol:5}  with {words}" for protocol, words in report.thresholds().items()),
         f"on     {provenance.hardware}; {provenance.seconds:.1f} s, peak memory {provenance.peak_memory_mib:.0f} MiB",
     ]
     return Text("\n".join(lines))
 
 
 def _exclusions(report: Report) -> Text:
-    """Say which images did not count, a task."""
-    if report.fair is None:
-        return Text("")
-    lane = None if report.fair.lane is None else report.fair.lane.as_labelled
-    parts = [
-        f"{task}: {scores.images} images count, {scores.both_empty} empty in both, {scores.not_labelled} not labelled"
-        for task, scores in (("detection", report.fair.detection), ("drivable", report.fair.drivable), ("lane", lane))
-        if scores is not None
-    ]
+    """Say which images did not count, a task, and at which confidence the best F1 is."""
+    parts = []
+    for task, scores in report.task_scores().items():
+        empty = "" if report.fair is None else f", {scores.both_empty} empty in both"
+        parts.append(f"{task}: {scores.images} images count{empty}, {scores.not_labelled} not labelled")
+    boxes = None if report.fair is None else report.fair.detection
+    if boxes is not None and not math.isnan(boxes.best.confidence):
+        parts[0] += f"; best F1 at confidence {boxes.best.confidence:.3g}"
     return Text("\n".join(parts))
 
 
@@ -430,7 +452,7 @@ def read_report(path: Path) -> Report:
             scores[name] = metrics.compute()
             metrics.figures(np.ones((1, len(names)), np.int32))  # as many images as the names
         plots = mapping["detection_plots"]
-        return Report(
+        report = Report(
             provenance=parse(Provenance, known, "provenance"),
             fair=scores.get("fair"),
             paper=scores.get("paper"),
@@ -468,8 +490,11 @@ def read_report(path: Path) -> Report:
                 for row in mapping["variations"]
             ),
         )
+        report.thresholds()  # are numbers
+        return report
     except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+        cure = "give the report.json, or its folder, that `trilitenet evaluate --output` has written"
+        raise DataError(f"{path}: cannot be read ({error.strerror}); {cure}") from error
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         if isinstance(error, DataError):
             raise

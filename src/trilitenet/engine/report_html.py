@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import base64
+from typing import Final
 
-from trilitenet.config import TASKS
+from trilitenet.config import TASKS, Task
 from trilitenet.engine.figures import CONDITION_FIGURES, HEADLINES, meaning
 from trilitenet.engine.overlays import FALSE, IGNORED, MISSED, RIGHT
 from trilitenet.engine.page import bar_cell, escape, histogram_plot, line_plot, page, percent, section, table
 from trilitenet.engine.report import FEW_IMAGES, Condition, DetectionPlots, Report, WorstFrame
+from trilitenet.metrics.published import PublishedSegmentationScores
 from trilitenet.metrics.segmentation import SegmentationScores
 
 __all__ = ["report_page"]
@@ -22,6 +24,8 @@ _PROTOCOLS = {
     "paper": "As the published evaluation: canvas size, averages over batches, recall at confidence 0.001. "
     "Comparable with published rows only.",
 }
+_MASKS: Final[dict[Task, str]] = {"drivable": "Drivable area", "lane": "Lane marking, as labelled"}
+_WITHOUT_FAIR = " The confusion of boxes and the worst images need the fair protocol."
 
 
 def report_page(report: Report) -> str:
@@ -77,7 +81,8 @@ def _figures(report: Report, protocol: str) -> str:
         )
     head = '<th>figure</th><th class="n">per cent, 95% interval</th>'
     body = f'<div class="card">{table(head, "".join(rows))}</div>'
-    return section(f"Figures, {protocol} protocol", body, _PROTOCOLS[protocol])
+    note = _PROTOCOLS[protocol] + (_WITHOUT_FAIR if report.fair is None else "")
+    return section(f"Figures, {protocol} protocol", body, note)
 
 
 def _detection(report: Report, plots: DetectionPlots) -> str:
@@ -90,22 +95,26 @@ def _detection(report: Report, plots: DetectionPlots) -> str:
             (at.recall, at.precision, f"at {at.confidence:.2f}"),
         ]
     cards = [
-        ("Precision and recall, IoU 0.5", line_plot(plots.recall, plots.precision, "recall", "precision", marks)),
         (
+            "card",
+            "Precision and recall, IoU 0.5",
+            line_plot(plots.recall, plots.precision, "recall", "precision", marks),
+        ),
+        (
+            "card",
             "Confidence of right and wrong boxes",
             histogram_plot(plots.right, plots.wrong, "confidence")
             + '<p class="note key"><span><i style="background:var(--right)"></i>right</span>'
             '<span><i style="background:var(--false)"></i>wrong</span><span>logarithmic scale</span></p>',
         ),
-        ("Confusion at the stated confidence", _confusion(plots)),
     ]
-    # A table of more than a few classes takes the whole width.
-    kinds = ("card", "card", "card wide" if len(plots.class_names) > 4 else "card")
-    body = "".join(
-        f'<div class="{kind}"><h3>{title}</h3>{content}</div>'
-        for kind, (title, content) in zip(kinds, cards, strict=True)
-    )
-    return section("Detection", f'<div class="grid">{body}</div>')
+    if plots.confusion:
+        # A table of more than a few classes takes the whole width.
+        kind = "card wide" if len(plots.class_names) > 4 else "card"
+        cards.append((kind, "Confusion at the stated confidence", _confusion(plots)))
+    body = "".join(f'<div class="{kind}"><h3>{title}</h3>{content}</div>' for kind, title, content in cards)
+    note = "Right and wrong by the published matching." if report.fair is None else ""
+    return section("Detection", f'<div class="grid">{body}</div>', note)
 
 
 def _confusion(plots: DetectionPlots) -> str:
@@ -122,18 +131,17 @@ def _confusion(plots: DetectionPlots) -> str:
 
 
 def _pixels(report: Report) -> str:
-    if report.fair is None:
-        return ""
-    lane = None if report.fair.lane is None else report.fair.lane.as_labelled
+    scores = report.task_scores()
     cards = [
-        f'<div class="card"><h3>{title}</h3>{_pixel_table(scores)}</div>'
-        for title, scores in (("Drivable area", report.fair.drivable), ("Lane marking, as labelled", lane))
-        if scores is not None
+        f'<div class="card"><h3>{title}</h3>{_pixel_table(scores[task])}</div>'
+        for task, title in _MASKS.items()
+        if task in scores
     ]
-    return section("Pixels", f'<div class="grid">{"".join(cards)}</div>') if cards else ""
+    note = "Over the data set, at canvas size." if report.fair is None else ""
+    return section("Pixels", f'<div class="grid">{"".join(cards)}</div>', note) if cards else ""
 
 
-def _pixel_table(scores: SegmentationScores) -> str:
+def _pixel_table(scores: SegmentationScores | PublishedSegmentationScores) -> str:
     total = scores.true_positive + scores.false_positive + scores.false_negative + scores.true_negative
 
     def cell(count: int) -> str:
@@ -145,11 +153,10 @@ def _pixel_table(scores: SegmentationScores) -> str:
         f"<tr><th>foreground</th>{cell(scores.true_positive)}{cell(scores.false_negative)}</tr>"
         f"<tr><th>background</th>{cell(scores.false_positive)}{cell(scores.true_negative)}</tr>"
     )
-    return (
-        f"{table(head, body, framed=True)}"
-        f'<p class="note">{scores.images} images count; {scores.both_empty} empty in truth and prediction and '
-        f"{scores.not_labelled} not labelled are left out.</p>"
-    )
+    left_out = f"{scores.not_labelled} not labelled"
+    if isinstance(scores, SegmentationScores):
+        left_out = f"{scores.both_empty} empty in truth and prediction and {left_out}"
+    return f'{table(head, body, framed=True)}<p class="note">{scores.images} images count; {left_out} are left out.</p>'
 
 
 def _conditions(report: Report, protocol: str) -> str:
@@ -212,14 +219,15 @@ def _frame(frame: WorstFrame) -> str:
 
 def _provenance(report: Report) -> str:
     known = report.provenance
+    settings = {name: value for name, value in known.settings.items() if name != "paper_thresholds"}
     rows = [
         ("model", known.model),
         ("model SHA-256", known.model_sha256 or "-"),
         ("runtime", known.runtime),
         ("data", f"{known.data}, split {known.split}, {known.images} images"),
         *((f"SHA-256 of {name}", value) for name, value in known.data_sha256.items()),
-        ("thresholds", ", ".join(f"{name} {value:g}" for name, value in known.thresholds.items())),
-        ("settings", ", ".join(f"{name} {value}" for name, value in known.settings.items())),
+        *((f"{protocol} with", words) for protocol, words in report.thresholds().items()),
+        ("settings", ", ".join(f"{name} {value}" for name, value in settings.items())),
         *((("intervals", f"drawn from {report.drawn}"),) if known.settings.get("resamples") else ()),
         ("canvas", ", ".join(known.canvas)),
         ("versions", ", ".join(f"{name} {value}" for name, value in known.versions.items())),

@@ -19,6 +19,7 @@ from trilitenet.engine.scoring import CanvasPrediction, FairMetrics, ImageOutcom
 from trilitenet.errors import ConfigError, DataError, did_you_mean
 from trilitenet.metrics.bootstrap import bootstrap, interval
 from trilitenet.metrics.detection import DetectionMetric
+from trilitenet.metrics.published import PublishedDetection
 from trilitenet.structures import Perception
 
 __all__ = ["CONDITIONS", "GROUP", "PAPER_THRESHOLDS", "PROTOCOLS", "Scorecard"]
@@ -43,6 +44,7 @@ class Scorecard:
         tasks: Tasks to score.
         protocol: ``"fair"``, ``"paper"`` or ``"both"``.
         confidence: The stated confidence of precision, recall and F1, and of boxes in pictures.
+        lowest: Boxes below this confidence may have been cut off.
         paper_batch: Images a batch of the published averages.
         worst: How many of the worst images to keep pictures of, a task; 0 for none.
         by: Attributes to make tables by.
@@ -60,6 +62,7 @@ class Scorecard:
         *,
         protocol: str = "fair",
         confidence: float = 0.25,
+        lowest: float = 0.0,
         paper_batch: int = 16,
         worst: int = 24,
         by: Sequence[str] = CONDITIONS,
@@ -69,10 +72,13 @@ class Scorecard:
             raise ConfigError(f"unknown protocol {protocol!r}; known: {', '.join(PROTOCOLS)}")
         self.protocols = ("fair", "paper") if protocol == "both" else (protocol,)
         self.tasks = tuple(task for task in TASKS if task in tasks)
-        self.fair = FairMetrics(class_names, self.tasks, confidence=confidence) if "fair" in self.protocols else None
+        self.fair = None
+        if "fair" in self.protocols:
+            self.fair = FairMetrics(class_names, self.tasks, confidence=confidence, lowest=lowest)
         self.paper = None
         if "paper" in self.protocols:
             self.paper = PaperMetrics(len(class_names), self.tasks, batch_size=paper_batch)
+        self._class_names = tuple(class_names)
         self._confidence = confidence
         self._keep = worst
         self._by = tuple(dict.fromkeys(by))
@@ -167,6 +173,8 @@ class Scorecard:
                     for table, value in zip(tables, values, strict=True):
                         table[f"{protocol}/{name}"] = float(value)
         fair, paper = self.fair, self.paper
+        scored = paper if fair is None else fair
+        boxes = None if scored is None else scored.detection
         labelled = members @ np.array(self._labelled, np.int64).reshape(count, len(self.tasks))
         return Report(
             fair=None if fair is None else fair.compute(),
@@ -176,7 +184,7 @@ class Scorecard:
                 Condition(attribute, value, int(sum(where)), table, dict(zip(self.tasks, map(int, own), strict=True)))
                 for (attribute, value, where), table, own in zip(rows, tables, labelled, strict=True)
             ),
-            plots=None if fair is None or fair.detection is None else _detection_plots(fair.detection),
+            plots=None if boxes is None else _detection_plots(boxes, self._class_names),
             worst=tuple(
                 entry[3]
                 for task in self.tasks
@@ -217,17 +225,18 @@ class Scorecard:
         return rows
 
 
-def _detection_plots(metric: DetectionMetric) -> DetectionPlots:
+def _detection_plots(metric: DetectionMetric | PublishedDetection, class_names: Sequence[str]) -> DetectionPlots:
     curve = metric.curve()
     count = len(curve.confidence)
     picked: NDArray[np.int64] = np.unique(np.linspace(0, max(count - 1, 0), min(count, _CURVE_POINTS)).astype(np.int64))
     right, wrong = metric.histogram(20)
+    confusion = metric.confusion if isinstance(metric, DetectionMetric) else ()  # the published matching knows none
     return DetectionPlots(
         recall=tuple(float(value) for value in curve.recall[picked]),
         precision=tuple(float(value) for value in curve.precision[picked]),
         confidence=tuple(float(value) for value in curve.confidence[picked]),
         right=tuple(int(value) for value in right),
         wrong=tuple(int(value) for value in wrong),
-        confusion=tuple(tuple(int(value) for value in row) for row in metric.confusion),
-        class_names=(*metric.class_names, "background"),
+        confusion=tuple(tuple(int(value) for value in row) for row in confusion),
+        class_names=(*class_names, "background"),
     )

@@ -155,10 +155,13 @@ class FairMetrics(_ByTask):
         class_names: Detection classes.
         tasks: Tasks to score.
         confidence: The stated confidence for precision, recall and F1 of detection.
+        lowest: Boxes below this confidence may have been cut off.
     """
 
-    def __init__(self, class_names: Sequence[str], tasks: Sequence[Task], *, confidence: float = 0.25) -> None:
-        self.detection = DetectionMetric(class_names, confidence) if "detection" in tasks else None
+    def __init__(
+        self, class_names: Sequence[str], tasks: Sequence[Task], *, confidence: float = 0.25, lowest: float = 0.0
+    ) -> None:
+        self.detection = DetectionMetric(class_names, confidence, lowest=lowest) if "detection" in tasks else None
         self.drivable = SegmentationMetric() if "drivable" in tasks else None
         self.lane = LaneMetric() if "lane" in tasks else None
 

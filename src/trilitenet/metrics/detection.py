@@ -29,14 +29,18 @@ from trilitenet.metrics.rows import Rows, pack_tables, unpack_tables
 
 __all__ = [
     "AREAS",
+    "COMMON_CONFIDENCE",
+    "COMMON_CUT",
     "IOU_THRESHOLDS",
     "DetectionCurve",
     "DetectionMetric",
     "DetectionScores",
     "OperatingPoint",
     "check_image",
+    "confidence_histogram",
     "in_regions",
     "match_boxes",
+    "precision_recall_curve",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -50,6 +54,10 @@ AREAS: Final[dict[str, tuple[float, float]]] = {
     "large": (96.0**2, 1e10),
 }
 """Box areas, in square pixels of the image as stored, both ends included (COCO's)."""
+COMMON_CONFIDENCE: Final = 0.25
+"""Precision, recall and F1 are given here too, whatever a model's own confidence."""
+COMMON_CUT: Final = 0.26
+"""Boxes that end above this confidence were cut off above the common one; those cut off there end a little above it."""
 _RECALLS: Final[FloatArray] = np.linspace(0.0, 1.0, 101)
 _ALL_BITS: Final = (1 << len(IOU_THRESHOLDS)) - 1
 _EPS: Final = float(np.spacing(1))
@@ -161,14 +169,20 @@ class DetectionMetric:
         class_names: Names that class ids index.
         confidence: The stated confidence of `DetectionScores.at` and of the confusion matrix.
         max_boxes: At most so many boxes an image and class count (COCO itself uses 100).
+        lowest: Boxes below this confidence may have been cut off; what they decide is undefined.
     """
 
     def __init__(
-        self, class_names: Sequence[str] = ("vehicle",), confidence: float = 0.25, max_boxes: int = 300
+        self,
+        class_names: Sequence[str] = ("vehicle",),
+        confidence: float = 0.25,
+        max_boxes: int = 300,
+        lowest: float = 0.0,
     ) -> None:
         self.class_names = tuple(class_names)
         self.confidence = confidence
         self.max_boxes = max_boxes
+        self.lowest = lowest
         self._thresholds = np.array(IOU_THRESHOLDS, np.float64)
         self._ranges = np.array(list(AREAS.values()), np.float64)
         areas, classes = len(AREAS), len(self.class_names)
@@ -180,6 +194,7 @@ class DetectionMetric:
         self._objects = Rows(areas * classes, np.int32)
         self._labelled = Rows(1, np.bool_)
         self._ranked: dict[tuple[int, int], RankedBoxes] = {}
+        self._best: OperatingPoint | None = None
         self._confusion: NDArray[np.int64] = np.zeros((classes + 1, classes + 1), np.int64)
 
     def __len__(self) -> int:
@@ -225,6 +240,7 @@ class DetectionMetric:
         """
         labelled = check_image(boxes, scores, class_id, truth, truth_class, len(self.class_names))
         self._ranked.clear()
+        self._best = None
         index = len(self._labelled)
         self._labelled.append(labelled)
         objects = np.zeros((len(self.class_names), len(AREAS)), np.int32)
@@ -364,38 +380,51 @@ class DetectionMetric:
 
     def curve(self) -> DetectionCurve:
         """Return precision and recall at IoU 0.5 along falling confidence, all classes together."""
-        hit, wrong = self._verdicts()
-        order = np.argsort(-self._scores.array[:, 0], kind="stable")
-        order = order[(hit | wrong)[order]]
-        scores = self._scores.array[order, 0].astype(np.float64)
-        right = np.cumsum(hit[order])
-        last = np.flatnonzero(np.append(scores[1:] != scores[:-1], True)) if len(scores) else np.zeros(0, np.int64)
-        objects = self._objects.array[:, :: len(AREAS)].sum()
-        return DetectionCurve(
-            confidence=scores[last],
-            precision=ratio(right[last], last + 1),
-            recall=ratio(right[last], float(objects)),
-        )
+        objects = int(self._objects.array[:, :: len(AREAS)].sum())
+        return precision_recall_curve(self._scores.array[:, 0], *self._verdicts(), objects)
 
     def histogram(self, bins: int = 20) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return how many right and wrong boxes (IoU 0.5) fall into equal bins of confidence from 0 to 1."""
-        scores = self._scores.array[:, 0]
-        hit, wrong = self._verdicts()
-        edges = np.linspace(0, 1, bins + 1)
-        return np.histogram(scores[hit], edges)[0], np.histogram(scores[wrong], edges)[0]
+        return confidence_histogram(self._scores.array[:, 0], *self._verdicts(), bins)
 
-    def _point_figures(self, weights: NDArray[Any] | None) -> dict[str, FloatArray]:
-        """Precision, recall and F1 at the stated confidence and IoU 0.5, from sums an image."""
-        above = self._scores.array[:, 0] > self.confidence
+    def _best_point(self) -> OperatingPoint:
+        """Return where F1 is best over all images, each counted once; found once for all weightings."""
+        if self._best is None:
+            objects = self._objects.array[:, :: len(AREAS)].any()
+            self._best = _best_point(self.curve()) if objects else OperatingPoint(*[float("nan")] * 4)
+        return self._best
+
+    def _point_figures(
+        self, weights: NDArray[Any] | None, confidence: float, suffix: str = ""
+    ) -> dict[str, FloatArray]:
+        """Precision, recall and F1 above a confidence at IoU 0.5, from sums an image."""
+        above = self._scores.array[:, 0] > confidence
         image = self._image.array[:, 0]
         boxes = [np.bincount(image[which & above], minlength=len(self)) for which in self._verdicts()]
         table = np.stack([*boxes, self._objects.array[:, :: len(AREAS)].sum(axis=1)], axis=1)
         right, bad, objects = weighted_sum(table, weights).T
         return {
-            "precision": ratio(right, right + bad),
-            "recall": ratio(right, objects),
-            "f1": ratio(2 * right, right + bad + objects),
+            f"precision{suffix}": ratio(right, right + bad),
+            f"recall{suffix}": ratio(right, objects),
+            f"f1{suffix}": ratio(2 * right, right + bad + objects),
         }
+
+    def _best_figures(self, weights: NDArray[Any] | None) -> dict[str, FloatArray]:
+        """Precision, recall and F1 at the confidence that is best over all images, whatever the weighting."""
+        below = np.nextafter(np.float32(self._best_point().confidence), np.float32(-1))
+        return self._point_figures(weights, float(below), "_best")
+
+    def _common_figures(self, weights: NDArray[Any] | None) -> dict[str, FloatArray]:
+        """Precision, recall and F1 at the common confidence, NaN where boxes above it may have been cut off."""
+        figures = self._point_figures(weights, COMMON_CONFIDENCE, "_025")
+        if self.lowest > COMMON_CUT:
+            return {name: np.full_like(value, np.nan) for name, value in figures.items()}
+        return figures
+
+    def _size_figures(self, weights: NDArray[Any] | None) -> dict[str, FloatArray]:
+        """AP50:95 of small, medium and large boxes."""
+        by_size = {name: self.average_precision(weights, name) for name in AREAS if name != "all"}
+        return {f"ap_{name}": mean_known(ap.reshape(len(ap), -1)) for name, ap in by_size.items()}
 
     def figures(self, weights: NDArray[Any] | None = None) -> dict[str, FloatArray]:
         """Return scores by name under R weightings of the images at once.
@@ -410,23 +439,22 @@ class DetectionMetric:
         return {
             "ap50": mean_known(ap[:, :, 0]),
             "ap": mean_known(ap.reshape(len(ap), -1)),
-            **self._point_figures(weights),
+            **self._size_figures(weights),
+            **self._point_figures(weights, self.confidence),
+            **self._best_figures(weights),
+            **self._common_figures(weights),
         }
 
     def compute(self) -> DetectionScores:
         """Return the scores over all images."""
         ap = self.average_precision()[0]
-        sizes = {
-            name: float(mean_known(self.average_precision(area=name)[0].reshape(1, -1))[0])
-            for name in AREAS
-            if name != "all"
-        }
+        sizes = {name: float(value[0]) for name, value in self._size_figures(None).items()}
         curve = self.curve()
         objects = self._objects.array[:, :: len(AREAS)].sum(axis=1)
         boxes = np.bincount(self._image.array[:, 0], minlength=len(self))
         labelled = self._labelled.array[:, 0]
         empty = labelled & (objects == 0) & (boxes == 0)
-        point = {name: float(value[0]) for name, value in self._point_figures(None).items()}
+        point = {name: float(value[0]) for name, value in self._point_figures(None, self.confidence).items()}
         return DetectionScores(
             images=int((labelled & ~empty).sum()),
             both_empty=int(empty.sum()),
@@ -436,11 +464,9 @@ class DetectionMetric:
             ap50=float(mean_known(ap[None, :, 0])[0]),
             ap75=float(mean_known(ap[None, :, 5])[0]),
             ap=float(mean_known(ap.reshape(1, -1))[0]),
-            ap_small=sizes["small"],
-            ap_medium=sizes["medium"],
-            ap_large=sizes["large"],
+            **sizes,
             ap50_by_class={name: float(ap[number, 0]) for number, name in enumerate(self.class_names)},
-            best=_best_point(curve) if objects.any() else OperatingPoint(*[float("nan")] * 4),
+            best=self._best_point(),
             at=OperatingPoint(self.confidence, **point),
             recall_all=float(curve.recall[-1]) if len(curve.recall) else (0.0 if objects.sum() else float("nan")),
         )
@@ -462,6 +488,7 @@ class DetectionMetric:
             "class_names": list(self.class_names),
             "confidence": self.confidence,
             "max_boxes": self.max_boxes,
+            "lowest": self.lowest,
             **pack_tables(self._tables()),
             "confusion": self._confusion.tolist(),
         }
@@ -469,10 +496,41 @@ class DetectionMetric:
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> DetectionMetric:
         """Read what `state` returned."""
-        metric = cls(state["class_names"], state["confidence"], state["max_boxes"])
+        metric = cls(state["class_names"], state["confidence"], state["max_boxes"], state.get("lowest", 0.0))
         unpack_tables(metric._tables(), state)
         metric._confusion = np.asarray(state["confusion"], np.int64)
         return metric
+
+
+def precision_recall_curve(
+    scores: NDArray[np.float32], right: NDArray[np.bool_], wrong: NDArray[np.bool_], objects: int
+) -> DetectionCurve:
+    """Return precision and recall along falling confidence.
+
+    Args:
+        scores: (D,) confidences, in any order.
+        right: (D,) whether each box is right.
+        wrong: (D,) whether each is wrong; what is neither does not count.
+        objects: True boxes.
+    """
+    order = np.argsort(-scores, kind="stable")
+    order = order[(right | wrong)[order]]
+    along = scores[order].astype(np.float64)
+    found = np.cumsum(right[order])
+    last = np.flatnonzero(np.append(along[1:] != along[:-1], True)) if len(along) else np.zeros(0, np.int64)
+    return DetectionCurve(
+        confidence=along[last],
+        precision=ratio(found[last], last + 1),
+        recall=ratio(found[last], float(objects)),
+    )
+
+
+def confidence_histogram(
+    scores: NDArray[np.float32], right: NDArray[np.bool_], wrong: NDArray[np.bool_], bins: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return how many right and wrong boxes, as `precision_recall_curve` takes them, fall into bins from 0 to 1."""
+    edges = np.linspace(0, 1, bins + 1)
+    return np.histogram(scores[right], edges)[0], np.histogram(scores[wrong], edges)[0]
 
 
 def match_boxes(
@@ -523,18 +581,16 @@ def _ap(sums: RankedSums, hit: NDArray[np.bool_], counted: NDArray[np.bool_], ob
         counted: (K,) whether each counts at all.
         objects: (B,) weight of the true boxes.
     """
-    right = np.cumsum(sums.weight * hit, axis=1)
-    wrong = sums.before + np.cumsum(sums.weight * (counted & ~hit), axis=1)
     # Precision is highest right after a hit, so only those positions matter.
-    right, wrong = right[:, hit], wrong[:, hit]
+    right = np.cumsum(sums.weight[:, hit], axis=1)
+    wrong = (sums.before + np.cumsum(sums.weight * (counted & ~hit), axis=1))[:, hit]
     precision = right / (right + wrong + _EPS)
     envelope = np.maximum.accumulate(precision[:, ::-1], axis=1)[:, ::-1]
     envelope = np.concatenate([envelope, np.zeros((len(envelope), 1))], axis=1)
-    out = np.full(len(objects), np.nan)
+    points = np.full((len(objects), len(_RECALLS)), np.nan)
     for row in np.flatnonzero(objects > 0):
-        position = np.searchsorted(right[row] / objects[row], _RECALLS, side="left")
-        out[row] = envelope[row, position].mean()
-    return out
+        points[row] = envelope[row, (right[row] / objects[row]).searchsorted(_RECALLS, side="left")]
+    return np.asarray(points.mean(axis=1))
 
 
 def _best_point(curve: DetectionCurve) -> OperatingPoint:

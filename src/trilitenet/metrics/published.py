@@ -27,7 +27,13 @@ from numpy.typing import NDArray
 
 from trilitenet.errors import ConfigError
 from trilitenet.metrics.arithmetic import box_overlap, mean_known, ratio, weighted_sum
-from trilitenet.metrics.detection import IOU_THRESHOLDS, check_image
+from trilitenet.metrics.detection import (
+    IOU_THRESHOLDS,
+    DetectionCurve,
+    check_image,
+    confidence_histogram,
+    precision_recall_curve,
+)
 from trilitenet.metrics.ranking import RankedBoxes, RankedSums
 from trilitenet.metrics.rows import Rows, pack_tables, unpack_tables
 from trilitenet.metrics.segmentation import as_binary, confusion
@@ -76,6 +82,10 @@ class PublishedSegmentationScores:
         dataset_acc: Likewise.
         dataset_iou: Likewise.
         dataset_recall: Likewise.
+        true_positive: Pixels at the size inside the canvas.
+        false_positive: Likewise.
+        false_negative: Likewise.
+        true_negative: Likewise.
     """
 
     images: int
@@ -88,6 +98,10 @@ class PublishedSegmentationScores:
     dataset_acc: float
     dataset_iou: float
     dataset_recall: float
+    true_positive: int
+    false_positive: int
+    false_negative: int
+    true_negative: int
 
 
 class PublishedSegmentation:
@@ -160,9 +174,14 @@ class PublishedSegmentation:
     def compute(self) -> PublishedSegmentationScores:
         """Return the scores over all images."""
         labelled = self._labelled.array[:, 0]
+        total = [int(value) for value in self._counts.array.sum(axis=0)]
         return PublishedSegmentationScores(
             images=int(labelled.sum()),
             not_labelled=int((~labelled).sum()),
+            true_positive=total[0],
+            false_positive=total[1],
+            false_negative=total[2],
+            true_negative=total[3],
             **{name: float(value[0]) for name, value in self.figures().items()},
         )
 
@@ -310,6 +329,20 @@ class PublishedDetection:
             "map50": mean_known(ap[:, :, 0]),
             "map": mean_known(ap.reshape(rounds, -1)),
         }
+
+    def curve(self) -> DetectionCurve:
+        """Return precision and recall at IoU 0.5 along falling confidence, all classes together."""
+        right = self._verdicts()
+        return precision_recall_curve(self._scores.array[:, 0], right, ~right, int(self._objects.array.sum()))
+
+    def histogram(self, bins: int = 20) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return how many right and wrong boxes (IoU 0.5) fall into equal bins of confidence from 0 to 1."""
+        right = self._verdicts()
+        return confidence_histogram(self._scores.array[:, 0], right, ~right, bins)
+
+    def _verdicts(self) -> NDArray[np.bool_]:
+        """Return whether each box is right at IoU 0.5; the others are wrong."""
+        return np.asarray((self._right.array[:, 0] & np.uint16(1)) != 0)
 
     def _ranking(self, number: int) -> RankedBoxes:
         """Return the boxes of a class, ranked: once for all weightings."""
