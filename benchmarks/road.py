@@ -8,6 +8,7 @@ python benchmarks/road.py --render drive           # drive/drive.mp4, camera.yam
 python benchmarks/road.py --results results/drive.json --truth drive/truth.json   # what `trilitenet predict` made of it
 python benchmarks/road.py --lanes 100              # time of lanes as curves at 640x384; with --model its masks too
 python benchmarks/road.py --feet DATA --stride 2   # how far the lower edges of the network's boxes are from the labels'
+python benchmarks/road.py --flicker 200 --model tiny   # what --smoothing does to flicker and IoU of the network's masks
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from trilitenet.data.contact_sheet import as_perception
@@ -34,7 +36,7 @@ from trilitenet.road.camera import write_camera
 from trilitenet.road.drawing import draw_road
 from trilitenet.road.lanes import find_lines
 from trilitenet.road.monitor import RoadMonitor
-from trilitenet.road.tracking import Steady
+from trilitenet.road.tracking import MaskSmoother, Steady, flicker
 from trilitenet.structures import Perception
 
 
@@ -164,6 +166,33 @@ def miss_feet(data: Path, model: str, stride: int) -> None:
         )
 
 
+def show_flicker(drive: SyntheticDrive, model: str, indices: range) -> None:
+    """Print flicker of the model's masks, and their IoU with the true ones, at several strengths of smoothing."""
+    import trilitenet
+
+    predictor = trilitenet.load(model)
+    kept: dict[str, list[NDArray[np.uint8]]] = {"drivable": [], "lane": []}  # (2, ...): true and seen, packed to bits
+    for index in indices:
+        scene = drive[index]
+        truth, seen = true_perception(scene), predictor(scene.sample.image)
+        for task, pairs in kept.items():
+            pairs.append(np.packbits(np.stack([getattr(truth, task), getattr(seen, task)])))
+    shape = (2, *drive.camera.size)
+    for task, pairs in kept.items():
+        restless = flicker(np.unpackbits(pair).reshape(shape)[0] > 0 for pair in pairs)
+        print(f"{task}: flicker of {len(pairs)} true masks {restless:.2%}")
+        for smoothing in (0.0, 0.1, 0.3, 0.5, 0.7, 0.9):
+            smoother, calm = MaskSmoother(smoothing), []
+            both = either = 0
+            for pair in pairs:
+                true, found = np.unpackbits(pair).reshape(shape) > 0
+                found = smoother.update(found)
+                both += np.count_nonzero(true & found)
+                either += np.count_nonzero(true | found)
+                calm.append(found)
+            print(f"  smoothing {smoothing}: flicker {flicker(calm):.2%}, IoU {both / max(either, 1):.4f}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
@@ -180,6 +209,12 @@ def main() -> None:
     parser.add_argument("--truth", type=Path, help="truth.json of --render")
     parser.add_argument("--lanes", type=int, metavar="SCENES", help="only time lanes as curves, on so many scenes")
     parser.add_argument("--feet", type=Path, metavar="DATA", help="only compare the model's boxes with labelled ones")
+    parser.add_argument(
+        "--flicker",
+        type=int,
+        metavar="FRAMES",
+        help="only smooth the model's masks, in so many frames of the lane change",
+    )
     options = parser.parse_args()
     if options.feet:
         miss_feet(options.feet, options.model or "tiny", options.stride)
@@ -194,6 +229,10 @@ def main() -> None:
         return
     frames = round(options.seconds * options.fps)
     drive = SyntheticDrive(options.seed, frames, options.fps, time=options.time, weather=options.weather)
+    if options.flicker:
+        first = round(0.4 * frames)
+        show_flicker(drive, options.model or "tiny", range(first, first + options.flicker))
+        return
     predictor = None
     if options.model:
         import trilitenet

@@ -78,6 +78,21 @@ def test_a_video_with_the_road(frames: Path, tmp_path: Path, scenes: list[Scene]
     assert documents[-1]["boxes"][0]["track_id"] == documents[-2]["boxes"][0]["track_id"] >= 1
 
 
+def test_smoothed_masks_leave_the_road_as_it_is(frames: Path, tmp_path: Path) -> None:
+    results = {}
+    for smoothing in (0.0, 0.9):
+        options = RoadOptions(camera=tmp_path / "camera.yaml", smoothing=smoothing)
+        folder = tmp_path / str(smoothing)
+        predict_with(
+            Predictor(ColourBackend()), [str(frames / "%03d.png")], folder, format="jsonl", rate=10.0, road=options
+        )
+        (path,) = folder.glob("*.jsonl")
+        results[smoothing] = [json.loads(line) for line in path.read_text().splitlines()]
+    masks, roads = ([[each[key] for each in run] for run in results.values()] for key in ("lane", "road"))
+    assert masks[0] != masks[1]
+    assert roads[0] == roads[1]
+
+
 def test_a_picture_with_the_road_and_without(frames: Path, tmp_path: Path, scenes: list[Scene]) -> None:
     picture = frames / "000.png"
     overlays = []

@@ -33,6 +33,19 @@ def test_signs_of_pitch_and_yaw(angle: str, axis: int, sign: int) -> None:
     assert moved[axis] * sign > 20
 
 
+@pytest.mark.parametrize(
+    ("name", "ends"), [("front", (0.0, 10.0)), ("left", (-2.0, 2.0)), ("vehicle_width", (0.5, 4.0))]
+)
+def test_the_place_in_the_vehicle_moves_no_pixel_and_has_a_range(name: str, ends: tuple[float, float]) -> None:
+    for value in ends:
+        placed = dataclasses.replace(CAMERA, **{name: value})  # type: ignore[arg-type]
+        np.testing.assert_array_equal(placed.to_pixels([[20.0, 1.0]]), CAMERA.to_pixels([[20.0, 1.0]]))
+        assert placed.to_dict()[name] == value
+    for value in (ends[0] - 0.1, ends[1] + 0.1, math.nan):
+        with pytest.raises(ConfigError, match=f"camera {name} must be between"):
+            dataclasses.replace(CAMERA, **{name: value})  # type: ignore[arg-type]
+
+
 def test_a_strong_lens_there_and_back() -> None:
     lens = (0.2, 0.1, 0.0, 0.0, 0.002, 0.55, 0.15, 0.01)
     camera = Camera((720, 1280), 370.0, 370.0, 639.5, 359.5, 1.4, 0.05, distortion=lens)

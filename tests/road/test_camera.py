@@ -16,8 +16,11 @@ from trilitenet.processing.geometry import Camera
 from trilitenet.road.camera import SelfCalibration, View, read_camera, write_camera
 from trilitenet.road.lanes import assign_positions, find_lines
 from trilitenet.road.structures import LaneLine
+from trilitenet.structures import Boxes
 
-CAMERA = Camera((720, 1280), 1100.0, 1105.0, 641.0, 355.0, 1.42, 0.03, -0.01, 0.005, (-0.3, 0.1, 0.001, 0.0, 0.0))
+CAMERA = Camera(
+    (720, 1280), 1100.0, 1105.0, 641.0, 355.0, 1.42, 0.03, -0.01, 0.005, (-0.3, 0.1, 0.001, 0.0, 0.0), 1.8, -0.3, 2.5
+)
 
 SHORT = "image_width: 640\nimage_height: 360\nheight: 1.3\n"
 
@@ -56,6 +59,15 @@ def test_writes_what_opencv_calibrates(tmp_path: Path) -> None:
     camera = Camera((height, width), fx, fy, cx, cy, mounted, distortion=lens)
     write_camera(camera, tmp_path / "camera.yaml")
     assert read_camera(tmp_path / "camera.yaml") == camera
+
+
+@pytest.mark.parametrize("lens", ["field_of_view: 60", "camera_matrix: [554, 0, 320, 0, 554, 180, 0, 0, 1]"])
+def test_where_the_camera_is_in_the_vehicle_may_be_told(tmp_path: Path, lens: str) -> None:
+    path = tmp_path / "camera.yaml"
+    for text, told in (("", (0.0, 0.0, None)), ("front: 1.8\nleft: -0.3\nvehicle_width: 2.5\n", (1.8, -0.3, 2.5))):
+        path.write_text(f"{SHORT}{lens}\n{text}")
+        camera = read_camera(path).resized((720, 1280))
+        assert (camera.front, camera.left, camera.vehicle_width) == told
 
 
 def test_reads_what_opencv_writes(tmp_path: Path) -> None:
@@ -107,6 +119,11 @@ def test_a_field_of_view_is_enough(tmp_path: Path) -> None:
             "must be finite numbers",
         ),
         (SHORT + "field_of_view: 60\ndistortion_coefficients: [-0.3, 0, 0, 0]\n", "for an ideal lens"),
+        (SHORT + "field_of_view: 60\nfront: -1.8\n", r"front must be between 0.0 and 10.0 metres, got -1.8"),
+        (SHORT + "field_of_view: 60\nfront: .nan\n", "front must be between 0.0 and 10.0 metres, got nan"),
+        (SHORT + "field_of_view: 60\nleft: 30\n", r"left must be between -2.0 and 2.0 metres, got 30"),
+        (SHORT + "field_of_view: 60\nvehicle_width: 0\n", r"vehicle_width must be between 0.5 and 4.0 metres, got 0"),
+        (SHORT + "field_of_view: 60\nvehicle_widht: 2\n", "did you mean 'vehicle_width'"),
         ("- 1\n", "must be a mapping"),
         ("a: [\n", "not YAML"),
     ],
@@ -164,9 +181,14 @@ def test_the_view_goes_there_and_back() -> None:
 def _seen(heading: float) -> list[LaneLine]:
     """Return the lines of a straight lane as a car sees them that points so many radians to its left."""
     mounted = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03, yaw=heading)
+    return _straight(mounted, 1.75, -1.75)
+
+
+def _straight(mounted: Camera, *sides: float) -> list[LaneLine]:
+    """Return straight lines so many metres to the left."""
     mask = np.zeros(mounted.size, np.uint8)
     ahead = np.linspace(5.0, 60.0, 100)
-    for side in (1.75, -1.75):
+    for side in sides:
         pixels = mounted.to_pixels(np.stack([ahead, np.full_like(ahead, side)], axis=1))
         cv2.polylines(mask, [np.round(pixels * 16).astype(np.int32)], False, 1, 3, shift=4)
     lines = find_lines(mask)
@@ -240,14 +262,79 @@ def test_bends_count_by_time_too() -> None:
 
 def test_a_camera_that_looks_to_the_left_is_told_so() -> None:
     mounted = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03, yaw=0.05)
-    mask = np.zeros(mounted.size, np.uint8)
-    ahead = np.linspace(5.0, 60.0, 100)
-    for side in (1.75, -1.75):
-        pixels = mounted.to_pixels(np.stack([ahead, np.full_like(ahead, side)], axis=1))
-        cv2.polylines(mask, [np.round(pixels).astype(np.int32)], False, 1, 3)
-    lines = find_lines(mask)
     calibration = SelfCalibration(mounted.size, still=True)
-    calibration.update(assign_positions(lines, [float(line.column(359.0)) - 319.5 for line in lines]), 0.0)
+    calibration.update(_straight(mounted, 1.75, -1.75, -5.25), 0.0)
     assert calibration.camera is not None
     assert calibration.camera.yaw == pytest.approx(0.05, abs=0.01)
     assert calibration.camera.pitch == pytest.approx(0.03, abs=0.01)
+
+
+def test_two_lines_that_meet_do_not_calibrate_a_picture() -> None:
+    mounted = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03)
+    for sides, told in (((1.75, -1.75), False), ((5.25, 1.75, -1.75), True)):
+        calibration = SelfCalibration(mounted.size, still=True)
+        calibration.update(_straight(mounted, *sides), 0.0)
+        assert (calibration.camera is not None) == told
+
+
+def _cars(mounted: Camera, *places: tuple[float, float], wide: float = 1.8) -> Boxes:
+    """Return boxes of rears so many metres ahead and to the left."""
+    rows = []
+    for ahead, left in places:
+        (start, foot), (end, _) = mounted.to_pixels([[ahead, left + wide / 2], [ahead, left - wide / 2]]) + 0.5
+        rows.append([start, foot - 0.8 * (end - start), end, foot])
+    count = len(places)
+    return Boxes(np.array(rows, np.float32), np.full(count, 0.9, np.float32), np.zeros(count, np.int64))
+
+
+@pytest.mark.parametrize("still", [True, False])
+def test_no_camera_where_vehicles_contradict_the_lane(still: bool) -> None:
+    mounted = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03)
+    places = ((10.0, 0.0), (16.0, 3.0), (30.0, -1.0))
+    cases = [
+        (1.75, places, 1.8, True),
+        (1.75, places, 2.55, True),  # lorries
+        (1.45, places, 2.55, True),  # in narrow lanes
+        (3.2, places, 1.8, False),  # the edges of a road of two lanes
+        (0.8, places, 1.8, False),  # a seam in the lane's middle
+        (3.2, (), 1.8, True),
+    ]
+    for half, seen, wide, told in cases:
+        calibration = SelfCalibration(mounted.size, still=still)
+        lines = _straight(mounted, half + 1.5, half, -half)
+        for frame in range(12):
+            calibration.update(lines, frame / 25, _cars(mounted, *seen, wide=wide) if seen else None)
+        assert (calibration.camera is not None) == told, (half, seen, wide)
+
+
+@pytest.mark.parametrize(
+    ("field_of_view", "rows"),
+    [
+        (30, [[0.0, 200.0, 40.0, 270.0]]),  # cut by the picture's edges: left, right, below
+        (30, [[600.0, 200.0, 640.0, 270.0]]),
+        (60, [[300.0, 300.0, 340.0, 360.0]]),
+        (60, [[100.0, 220.0, 130.0, 250.0]]),  # far aside
+        (60, [[316.0, 176.0, 321.0, 182.0]]),  # far away
+        (60, [[270.0, 170.0, 370.0, 241.0], [260.0, 180.0, 285.0, 230.0], [355.0, 180.0, 380.0, 230.0]]),  # half hidden
+    ],
+)
+def test_what_is_not_seen_whole_contradicts_nothing(field_of_view: float, rows: list[list[float]]) -> None:
+    mounted = Camera.from_field_of_view((360, 640), field_of_view, 1.4, pitch=0.03)
+    count = len(rows)
+    boxes = Boxes(np.array(rows, np.float32), np.full(count, 0.9, np.float32), np.zeros(count, np.int64))
+    calibration = SelfCalibration(mounted.size, field_of_view=field_of_view, still=True)
+    calibration.update(_straight(mounted, 5.25, 1.75, -1.75), 0.0, boxes)
+    assert calibration.camera is not None
+
+
+def test_a_video_is_not_contradicted_by_few_frames() -> None:
+    mounted = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03)
+    calibration, lines, odd = SelfCalibration(mounted.size), _seen(0.0), _cars(mounted, (12.0, 0.0), wide=0.8)
+    for frame in range(12 + SelfCalibration.NEEDED - 1):
+        calibration.update(lines, frame / 10, odd if frame >= 12 else None)
+    assert calibration.camera is not None
+    calibration.update(lines, 2.3, odd)
+    assert calibration.camera is None
+    for frame in range(24, 60):
+        calibration.update(lines, frame / 10, _cars(mounted, (12.0, 0.0)))
+    assert calibration.camera is not None

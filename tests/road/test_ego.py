@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import cv2
@@ -223,6 +224,53 @@ def test_the_error_of_a_time_to_collision_has_what_is_not_in_the_speed_alike() -
         left = found.time_to_collision
         assert abs(left.value - true / 30) < 2 * left.error
         assert (left.error > 0.4) == (off > 0)
+
+
+def test_a_collision_is_of_the_bumper_not_of_the_lens() -> None:
+    camera = dataclasses.replace(CAMERA, front=1.8)
+    leads = LeadFilter()
+    for frame in range(101):
+        boxes = standing((20 - 3 * frame / 25 + REAR_OVERHANG, 0.0))  # 3 m/s nearer, in the end 8 m from the lens
+        (distance,) = find_distances(boxes, camera, CameraErrors())
+        assert distance is not None
+        found = leads.update(LeadVehicle(0, 3, distance), boxes, frame / 25, camera, 0.0, 0.011)
+    assert found is not None
+    assert found.distance.value == pytest.approx(8 - 1.8, abs=0.05)
+    assert found.closing_speed is not None
+    assert found.closing_speed.value == pytest.approx(3.0, abs=0.05)
+    assert found.time_to_collision is not None
+    assert found.time_to_collision.value == pytest.approx(6.2 / 3, abs=0.05)  # 2.07 s; the windscreen has 2.67 s
+
+
+def test_a_bumper_before_the_lens_changes_neither_reach_nor_errors() -> None:
+    nearer = dataclasses.replace(CAMERA, front=5.0)
+    boxes = standing((6.0, 0.0), (6.8, 0.0), *((float(ahead), 0.0) for ahead in np.linspace(60, 160, 400)))
+    plain, told = (find_distances(boxes, camera, CameraErrors()) for camera in (CAMERA, nearer))
+    assert plain[0] is not None
+    assert told[0] is None, "less than half a metre before the bumper"
+    assert told[1] is not None
+    assert told[1].value == pytest.approx(6.8 - REAR_OVERHANG - 5.0, abs=0.05)
+    for one, other in zip(plain[1:], told[1:], strict=True):
+        assert (one is None) == (other is None)
+        assert one is None or other is None or one.error == other.error
+    found = []
+    for camera in (CAMERA, nearer):
+        leads = LeadFilter()
+        for frame in range(51):
+            seen = 40.0 - 10 * frame / 25
+            lead = LeadVehicle(0, 3, Estimate(seen - camera.front, math.hypot(0.1, 0.2 * seen)))
+            lead = leads.update(lead, boxes, frame / 25, camera, 0.0, 0.2) or lead
+        found.append(lead)
+    assert found[0].closing_speed is not None
+    assert found[1].closing_speed is not None
+    assert found[1].closing_speed.error == pytest.approx(found[0].closing_speed.error)
+    assert found[1].distance.error == pytest.approx(found[0].distance.error)
+    times = [lead.time_to_collision for lead in found if lead.time_to_collision is not None]
+    assert times[1].value == pytest.approx(times[0].value - 0.5, abs=0.01)
+    # All but the bumper's 5 m is wrong by the scale in distance and speed alike; what else the speed errs by is less.
+    rate = math.sqrt(found[0].closing_speed.error ** 2 - (0.2 * 10) ** 2)
+    shares = [(10 * left.error) ** 2 - (left.value * rate) ** 2 for left in times]
+    assert shares[1] == pytest.approx(shares[0] + (0.2 * 5) ** 2, rel=0.05)
 
 
 def test_a_speed_that_may_be_noise_is_not_told() -> None:

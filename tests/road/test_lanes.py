@@ -43,6 +43,17 @@ def test_two_straight_lines_and_their_place() -> None:
         assert line.points[0, 1] > line.points[-1, 1]
 
 
+def test_the_json_form_has_the_curve_in_pixels() -> None:
+    v = np.linspace(383, 185, 60)
+    (line,) = find_lines(paint(np.stack([200 + 0.4 * (383 - v) + 1500 / (v - 165), v], axis=1)))
+    form = line.to_dict()
+    assert form["ground"] is None
+    v0, span = form["origin"]
+    rows = np.linspace(v0, v0 + span, 9)
+    columns = np.polynomial.Polynomial(form["polynomial"])((rows - v0) / span)
+    np.testing.assert_allclose(columns, line.column(rows), atol=0.02)
+
+
 def test_a_line_keeps_its_rows_where_the_height_is_no_multiple_of_the_scale() -> None:
     (line,) = find_lines(paint(straight(133, 2133, (1438, 720)), size=(1439, 2560), thickness=12))
     rows = np.linspace(800, 1400, 20)

@@ -225,6 +225,52 @@ def test_with_one_line_in_sight_the_lane_has_the_width_from_before() -> None:
     assert lane.offset.value == pytest.approx(0.3, abs=0.1)
 
 
+@pytest.mark.parametrize("still", [True, False])
+def test_a_road_that_vehicles_are_too_narrow_for_is_no_lane(still: bool) -> None:
+    camera = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03)
+    road = marked(camera, 4.7, 3.2, -3.2)
+    (start, foot), (end, _) = camera.to_pixels([[12.0, 0.9], [12.0, -0.9]])
+    box = np.array([[start, foot - 40, end, foot]], np.float32)
+    vehicle = Boxes(box, np.full(1, 0.9, np.float32), np.zeros(1, np.int64))
+    for boxes, name in ((None, "vehicle"), (vehicle, "person"), (vehicle, "vehicle"), (vehicle, "Car")):
+        road = dataclasses.replace(road, class_names=(name,))
+        monitor = RoadMonitor(still=still)
+        for frame in range(1 if still else 30):  # the video has its camera before the vehicles come
+            seen = boxes if still or frame >= 15 else None
+            found = monitor(dataclasses.replace(road, boxes=seen, timestamp=frame / 10))
+            assert still or frame != 20 or found.camera is not None
+        assert (found.camera is None) == (boxes is not None and name != "person")
+
+
+@pytest.mark.parametrize("still", [True, False])
+@pytest.mark.parametrize("left", [0.0, 0.3, -0.3])
+def test_offsets_are_those_of_the_middle_of_the_vehicle(left: float, still: bool) -> None:
+    camera = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03)
+    monitor = RoadMonitor(dataclasses.replace(camera, left=left), still=still)
+    for _ in range(5):
+        lane = monitor(marked(camera, 1.6, -2.0)).ego_lane  # the lens is 0.2 m left of the lane's centre
+    assert lane is not None
+    assert lane.offset is not None
+    assert lane.offset.value == pytest.approx(0.2 - left, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("told", "departs"),
+    [
+        ({}, False),  # 1.75 - 0.25 - 0.9 = 0.6 m of room on the left
+        ({"vehicle_width": 2.5}, False),  # 0.25 m
+        ({"vehicle_width": 2.5, "left": -0.2}, True),  # 0.05 m, for the middle is 0.45 m left of the lane's
+        ({"left": -0.6}, True),  # 0.0 m
+    ],
+)
+def test_departures_are_those_of_the_sides_of_the_vehicle(told: dict[str, float], departs: bool) -> None:
+    camera = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03, yaw=0.02)  # 0.02 rad to the left
+    driven = RoadMonitor(dataclasses.replace(camera, yaw=0.0, **told))  # type: ignore[arg-type]
+    for _ in range(20):
+        road = driven(marked(camera, 1.5, -2.0))
+    assert road.warnings == (("lane_departure_left",) if departs else ())
+
+
 @pytest.mark.parametrize("radius", [300, -500])
 def test_a_bend_that_is_calibrated_as_yaw_is_in_the_errors(radius: int) -> None:
     camera = Camera.from_field_of_view((720, 1280), 60.0, 1.4, pitch=0.03)

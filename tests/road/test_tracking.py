@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import sys
 
 import numpy as np
@@ -146,16 +147,35 @@ def test_smoothing_follows_a_lasting_change_and_a_new_size() -> None:
     smoother.update(np.zeros((10, 10), bool))
     on = np.ones((10, 10), bool)
     answers = [bool(smoother.update(on).all()) for _ in range(4)]
-    assert answers == [False, True, True, True]
+    assert answers == [False, False, False, True]
     assert smoother.update(np.ones((5, 5), bool)).shape == (5, 5)
     with pytest.raises(ConfigError, match="below 1"):
         MaskSmoother(1.0)
 
 
-def test_what_is_in_half_of_the_mean_is_off() -> None:
-    smoother = MaskSmoother(0.5)
+@pytest.mark.parametrize("strength", [0.01, 0.1, 0.3, 0.5])
+def test_a_flash_of_one_frame_is_off_at_any_strength(strength: float) -> None:
+    smoother = MaskSmoother(strength)
     on, off = np.ones((2, 2), np.bool_), np.zeros((2, 2), np.bool_)
-    assert [bool(smoother.update(mask).any()) for mask in (off, on, on)] == [False, False, True]
+    assert not any(smoother.update(mask).any() for mask in (off, on, off, off))
+
+
+def test_more_smoothing_leaves_less_flicker(rng: np.random.Generator) -> None:
+    noisy = [rng.random((60, 80)) < 0.8 for _ in range(40)]
+    left = []
+    for strength in (0.0, 0.1, 0.3, 0.5, 0.7, 0.9):
+        smoother = MaskSmoother(strength)
+        left.append(flicker([smoother.update(mask) for mask in noisy]))
+    assert all(more < 0.9 * less for less, more in itertools.pairwise(left)), left
+
+
+@pytest.mark.parametrize(("strength", "frames"), [(0.0, 0), (0.1, 1), (0.4, 1), (0.5, 2), (0.7, 4), (0.9, 13)])
+def test_a_moving_edge_lags_by_as_many_frames_as_is_said(strength: float, frames: int) -> None:
+    grows, shrinks = MaskSmoother(strength), MaskSmoother(strength)
+    columns = np.arange(100)[None]
+    for frame in range(40):
+        grown, shrunk = grows.update(columns < 10 + frame), shrinks.update(columns < 90 - frame)
+    assert (int(grown.sum()), int(shrunk.sum())) == (49 - frames, 51 + frames)
 
 
 def test_masks_may_lie_column_by_column(rng: np.random.Generator) -> None:

@@ -28,6 +28,8 @@ Floats = NDArray[np.float64]
 
 _EXACT: Final = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)
 """When the inverse of a lens is found: OpenCV's usual five steps leave wide lenses pixels off."""
+_OF_VEHICLE: Final = {"front": (0.0, 10.0), "left": (-2.0, 2.0), "vehicle_width": (0.5, 4.0)}
+"""Metres between which a camera's place in a vehicle, and the vehicle's width, can be."""
 _MAX_MISS: Final = 0.5
 """Pixels by which a pixel may miss itself, there and back through the lens; beyond, the lens cannot show it."""
 
@@ -47,10 +49,13 @@ class Camera:
         yaw: Radians the camera looks to the left of the vehicle's axis.
         roll: Radians the right side of the camera is lowered.
         distortion: OpenCV's coefficients (k1, k2, p1, p2[, k3[, ...]]); empty for an ideal lens.
+        front: Metres from the lens forward to the vehicle's front bumper. This and the next two move no pixel.
+        left: Metres the lens is left of the vehicle's middle.
+        vehicle_width: Metres; None where it is not known.
 
     Raises:
-        ConfigError: If a number is not finite, a length not positive, an angle not between -pi/2 and pi/2, or the
-            number of distortion coefficients not one of OpenCV's.
+        ConfigError: If a number is not finite, a length not positive, an angle not between -pi/2 and pi/2, the
+            number of distortion coefficients not one of OpenCV's, or the vehicle not one of a road's.
     """
 
     size: tuple[int, int]
@@ -63,6 +68,9 @@ class Camera:
     yaw: float = 0.0
     roll: float = 0.0
     distortion: tuple[float, ...] = ()
+    front: float = 0.0
+    left: float = 0.0
+    vehicle_width: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("fx", "fy", "height"):
@@ -75,6 +83,10 @@ class Camera:
             value = getattr(self, name)
             if not abs(value) < math.pi / 2:
                 raise ConfigError(f"camera {name} must be between -90 and 90 degrees, got {math.degrees(value):.1f}")
+        for name, (least, most) in _OF_VEHICLE.items():
+            value = getattr(self, name)
+            if value is not None and not least <= value <= most:
+                raise ConfigError(f"camera {name} must be between {least} and {most} metres, got {value}")
         if len(self.size) != 2 or min(self.size) < 1:
             raise ConfigError(f"camera size must be (height, width) in pixels, got {self.size}")
         if len(self.distortion) not in (0, 4, 5, 8, 12, 14):
@@ -253,4 +265,7 @@ class Camera:
             "yaw": self.yaw,
             "roll": self.roll,
             "distortion": list(self.distortion),
+            "front": self.front,
+            "left": self.left,
+            "vehicle_width": self.vehicle_width,
         }

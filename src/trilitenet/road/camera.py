@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from trilitenet.config import parse, parse_yaml
 from trilitenet.errors import ConfigError, write_file
 from trilitenet.processing.geometry import Camera
-from trilitenet.road.lanes import vanishing_point
+from trilitenet.road.lanes import VanishingPoint, vanishing_point
 from trilitenet.road.structures import LATE, LaneLine
+from trilitenet.structures import Boxes
 
 __all__ = ["CameraErrors", "SelfCalibration", "View", "read_camera", "write_camera"]
 
@@ -61,9 +62,14 @@ class _CameraFile:
     pitch: float = 0.0
     yaw: float = 0.0
     roll: float = 0.0
+    front: float = 0.0
+    left: float = 0.0
+    vehicle_width: float | None = None
     camera_name: str = ""
 
 
+_OF_VEHICLE: Final = ("front", "left", "vehicle_width")
+"""Where the camera is in the vehicle, and how wide that is: left out where it is not known."""
 _LENSES: Final = ("plumb_bob", "rational_polynomial")
 """Distortion models of ROS that are OpenCV's, which `Camera` has."""
 _ROS: Final = {"rectification_matrix", "projection_matrix"}
@@ -81,7 +87,8 @@ def read_camera(path: str | Path) -> Camera:
     The intrinsics are as OpenCV and ROS write them (``image_width``, ``image_height``, ``camera_matrix`` and
     ``distortion_coefficients`` with their ``data``; what else their calibration programs write is passed over), or
     ``field_of_view`` in degrees for an ideal lens. To these come the mounting: ``height`` in metres, and ``pitch``
-    (down), ``yaw`` (left), ``roll`` (right side lowered) in degrees.
+    (down), ``yaw`` (left), ``roll`` (right side lowered) in degrees. ``front`` (from the lens forward to the front
+    bumper), ``left`` (lens left of the vehicle's middle) and ``vehicle_width`` in metres may be left out.
 
     Raises:
         ConfigError: If the file is missing or not YAML, has an unknown key, lacks one, a value is out of range, or the
@@ -110,13 +117,15 @@ def read_camera(path: str | Path) -> Camera:
     size = (file.image_height, file.image_width)
     pitch, yaw, roll = (math.radians(angle) for angle in (file.pitch, file.yaw, file.roll))
     lens = () if file.distortion_coefficients is None else file.distortion_coefficients.data
+    of_vehicle: dict[str, Any] = {name: getattr(file, name) for name in _OF_VEHICLE}
     try:
         if file.camera_matrix is None:
             if file.field_of_view is None:
                 raise ConfigError("needs camera_matrix, or field_of_view in degrees")
             if any(lens):
                 raise ConfigError("field_of_view is for an ideal lens; distortion_coefficients need camera_matrix")
-            return Camera.from_field_of_view(size, file.field_of_view, file.height, pitch=pitch, yaw=yaw, roll=roll)
+            camera = Camera.from_field_of_view(size, file.field_of_view, file.height, pitch=pitch, yaw=yaw, roll=roll)
+            return dataclasses.replace(camera, **of_vehicle)
         if file.field_of_view is not None:
             raise ConfigError("camera_matrix and field_of_view exclude each other")
         matrix = file.camera_matrix.data
@@ -126,7 +135,7 @@ def read_camera(path: str | Path) -> Camera:
             raise ConfigError("camera_matrix must be [fx, 0, cx, 0, fy, cy, 0, 0, 1]: pixels cannot be skewed")
         return Camera(
             size, matrix[0], matrix[4], matrix[2], matrix[5], file.height, pitch, yaw, roll,
-            lens if any(lens) else (),
+            lens if any(lens) else (), **of_vehicle,
         )  # fmt: skip
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
@@ -151,6 +160,7 @@ def write_camera(camera: Camera, path: str | Path) -> None:
         "distortion_coefficients": {"rows": 1, "cols": len(lens), "data": lens},
         "height": float(camera.height),
         **{name: math.degrees(getattr(camera, name)) for name in ("pitch", "yaw", "roll")},
+        **{name: float(value) for name in _OF_VEHICLE if (value := getattr(camera, name)) is not None},
     }
     write_file(Path(path), yaml.safe_dump(content, sort_keys=False))
 
@@ -159,8 +169,9 @@ class SelfCalibration:
     """Estimates how the camera is mounted from the lanes alone.
 
     Pitch and yaw follow from where they vanish, the height from the width of a lane. It trusts itself once enough
-    frames agree. From then on it takes in frames by time, and few of lines that do not move: the car may stand, and not
-    along the lane.
+    frames agree, unless vehicles would be too narrow or too wide beside the lane: then that is none, but a whole road,
+    say. From then on it takes in frames by time, and few of lines that do not move: the car may stand, and not along
+    the lane.
 
     The focal length cannot be seen from lanes: it follows from the assumed field of view, and its uncertainty goes into
     every distance. Offsets across the lane do not depend on it. Roll is taken to be 0, and lines to be straight: what a
@@ -171,7 +182,7 @@ class SelfCalibration:
         size: (height, width) of the pictures in pixels.
         field_of_view: Horizontal, in degrees.
         lane_width: Metres between the middles of a lane's two lines.
-        still: A single picture is all there will be: one good vanishing point is enough.
+        still: A single picture is all there will be: one vanishing point is enough, of more lines than two.
     """
 
     WINDOW: Final = 250
@@ -183,10 +194,15 @@ class SelfCalibration:
     UNMOVED_INTERVAL: Final = 2.0
     """Seconds between those."""
     NEEDED: Final = 12
-    """Frames with a vanishing point before it is trusted."""
+    """Frames with a vanishing point before it is trusted; and frames with vehicles before they may contradict it."""
+    STILL_LINES: Final = 3
+    """Lines that must agree on where they vanish in a single picture: two always meet somewhere."""
+    VEHICLE_WIDTHS: Final = (1.4, 3.2)
+    """Metres between which vehicles are wide in the median: a small car in a lane wider than assumed, a lorry in a
+    narrower one."""
     FOCAL_ERROR: Final = 0.15
     """Standard deviation of the assumed focal length, as a share."""
-    WIDTH_ERROR: Final = 0.06
+    WIDTH_ERROR: Final = 0.10
     """Standard deviation of the assumed lane width, as a share."""
     ROLL_ERROR: Final = 0.02
     """Standard deviation of the roll, which is taken to be 0, in radians."""
@@ -204,6 +220,7 @@ class SelfCalibration:
         self._points: deque[tuple[float, float, float]] = deque(maxlen=self.WINDOW)
         self._spreads: deque[float] = deque(maxlen=self.WINDOW)
         self._bends: deque[float] = deque(maxlen=self.WINDOW)
+        self._vehicles: deque[float] = deque(maxlen=self.WINDOW)
         self._last = -math.inf
         self._taken = False
         self._place: tuple[float, float] = (math.inf, math.inf)
@@ -211,12 +228,13 @@ class SelfCalibration:
         self.camera: Camera | None = None
         self.errors = CameraErrors()
 
-    def update(self, lines: Sequence[LaneLine], timestamp: float) -> None:
-        """Take in the lines of one frame.
+    def update(self, lines: Sequence[LaneLine], timestamp: float, boxes: Boxes | None = None) -> None:
+        """Take in one frame.
 
         Args:
             lines: With their positions (see `assign_positions`) where known.
             timestamp: Seconds.
+            boxes: Vehicles.
         """
         self._taken = False
         step = timestamp - self._last
@@ -225,6 +243,8 @@ class SelfCalibration:
         found = vanishing_point(lines, self.size)
         height = self.size[0]
         if found is None or found.error > 0.03 * height or not 0.1 * height < found.v < 0.75 * height:
+            return
+        if self.still and found.lines < self.STILL_LINES:
             return
         if math.dist((found.u, found.v), self._place) > found.error:
             self._place, self._unmoved = (found.u, found.v), 0
@@ -241,6 +261,8 @@ class SelfCalibration:
             if low - found.v > 0.2 * height:
                 # The width of a lane in pixels grows in proportion to the distance below the horizon.
                 self._spreads.append(float(right.column(low) - left.column(low)) / (low - found.v))
+        if boxes is not None and len(widths := _vehicle_widths(boxes, self._level, found)):
+            self._vehicles.append(float(np.median(widths)))
         self._solve()
 
     def see_bend(self, curvature: float) -> None:
@@ -274,10 +296,32 @@ class SelfCalibration:
         if not 0.5 < mounted < 4.5:
             self.camera = None
             return
+        low_width, high_width = self.VEHICLE_WIDTHS
+        if len(self._vehicles) >= needed:
+            wide = self.lane_width * float(np.median(self._vehicles)) / spread
+            if not low_width < wide < high_width:
+                self.camera = None
+                return
         self.camera = dataclasses.replace(self._level, height=mounted, pitch=pitch, yaw=yaw)
         yaw_error = float(scatter[0]) / focal + (0.02 if self.still else 0.003)
         yaw_error += self.BEND_REACH * abs(float(np.median(self._bends))) if self._bends else 0.0
         self.errors = CameraErrors(pitch_error, yaw_error, self.WIDTH_ERROR, self.FOCAL_ERROR, self.ROLL_ERROR)
+
+
+def _vehicle_widths(boxes: Boxes, level: Camera, point: VanishingPoint) -> NDArray[np.float64]:
+    """Return widths of vehicles as `SelfCalibration` has those of lanes: pixels a row below the horizon.
+
+    Left out are those that the picture's edge cuts, whose foot a nearer one hides, or that are far away or far aside.
+    A box has some of a vehicle's side in it, too: as much again for each half radian that it stands aside.
+    """
+    height, width = level.size
+    left, top, right, foot = boxes.xyxy.T.astype(np.float64) - 0.5
+    aside = np.abs((left + right) / 2 - point.u) / level.fx
+    beside = (left < right[:, None]) & (right > left[:, None])
+    hidden = (beside & (foot > foot[:, None]) & (top < foot[:, None])).any(axis=1)
+    whole = (left > 0.5) & (right < width - 1.5) & (foot < height - 1.5)
+    keep = whole & ~hidden & (foot - point.v > 0.06 * height) & (aside < 0.3)
+    return np.asarray(((right - left) / (foot - point.v) / (1 + 2 * aside))[keep])
 
 
 @dataclasses.dataclass(frozen=True)

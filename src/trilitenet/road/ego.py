@@ -56,7 +56,7 @@ MAX_OFFSET_ERROR: Final = 0.4
 MAX_HEADING_ERROR: Final = 0.04
 MAX_CURVATURE_ERROR: Final = 0.006
 MAX_DISTANCE_ERROR: Final = 0.30
-"""Of the distance, as a share."""
+"""Of the distance from the lens, as a share."""
 
 
 class LaneFit(NamedTuple):
@@ -409,17 +409,21 @@ def find_lead(boxes: Boxes, distances: Sequence[Estimate | None], fit: LaneFit, 
 
 
 def find_distances(boxes: Boxes, camera: Camera, errors: CameraErrors) -> tuple[Estimate | None, ...]:
-    """Return metres to the nearest end of each vehicle; None for one that is cut off below or too far to tell."""
+    """Return metres from the own bumper to the nearest end of each vehicle.
+
+    The bumper is ``camera.front`` before the lens. None is for a vehicle that is cut off below or too far to tell.
+    """
     height, width = camera.size
     left, _, right, bottom = boxes.xyxy.T.astype(np.float64) - 0.5
     ground = camera.to_ground(np.stack([(left + right) / 2, bottom], axis=1))
     found: list[Estimate | None] = []
     for x, row, box in zip(ground[:, 0].tolist(), bottom.tolist(), boxes.xyxy, strict=True):
         estimate = None
-        if math.isfinite(x) and x > REAR_OVERHANG + 0.5 and row < height - 1.5:
+        seen = x - REAR_OVERHANG
+        if math.isfinite(x) and seen > camera.front + 0.5 and row < height - 1.5:
             error = _distance_error(x, camera, errors, _box_error(box, width))
-            if error <= MAX_DISTANCE_ERROR * (x - REAR_OVERHANG):
-                estimate = Estimate(x - REAR_OVERHANG, error)
+            if error <= MAX_DISTANCE_ERROR * seen:
+                estimate = Estimate(seen - camera.front, error)
         found.append(estimate)
     return tuple(found)
 
@@ -485,13 +489,15 @@ class LeadFilter:
             timestamp: Seconds.
             camera: The camera.
             shaken: Metres, of the error of the distance: what this frame adds to it, as the pitch of a bump does.
-            scale: Share of the distance, of its error: what is in the speed alike, and so not in the time to collision.
+            scale: Share of the distance from the lens, of its error: what is in the speed alike, and so not in the time
+                to collision but for what the bumper is nearer.
         """
         if lead is None:
             return None
         box = boxes.xyxy[lead.box]
         pixel = self.BOX_NOISE * camera.size[1] / 640
-        noise = math.hypot(pixel * (lead.distance.value**2 + camera.height**2) / (camera.fy * camera.height), shaken)
+        seen = lead.distance.value + camera.front
+        noise = math.hypot(pixel * (seen**2 + camera.height**2) / (camera.fy * camera.height), shaken)
         step = timestamp - self._last
         same = self._state is not None and -LATE <= step <= self.GAP + 1e-6 and self._is_same(lead, box)
         late = self._state is not None and -LATE <= step < 0
@@ -514,12 +520,13 @@ class LeadFilter:
         limit = max(self.MAX_SPEED_ERROR, self.MAX_SPEED_SHARE * abs(rate))
         if self._last - self._since < self.NEEDED or rate_spread > limit:
             return dataclasses.replace(lead, distance=found)
-        closing = Estimate(-rate, math.hypot(rate_spread, rate * systematic / max(distance, 1.0)))
+        seen = distance + camera.front
+        closing = Estimate(-rate, math.hypot(rate_spread, rate * systematic / max(seen, 1.0)))
         left = None
         if -rate > max(0.5, 2 * rate_spread) and distance / -rate < self.MAX_TIME:
-            time = distance / -rate
-            uneven = math.sqrt(max(systematic**2 - (scale * distance) ** 2, 0.0))
-            left = Estimate(time, time * math.hypot(spread / distance, rate_spread / rate, uneven / distance))
+            time = max(distance, 0.0) / -rate
+            uneven = math.sqrt(max(systematic**2 - (scale * seen) ** 2, 0.0))
+            left = Estimate(time, math.hypot(spread, time * rate_spread, uneven, scale * camera.front) / -rate)
         return dataclasses.replace(lead, distance=found, closing_speed=closing, time_to_collision=left)
 
     def _is_same(self, lead: LeadVehicle, box: NDArray[np.float32]) -> bool:

@@ -23,7 +23,7 @@ class EventThresholds:
     """When events begin and end.
 
     Attributes:
-        vehicle_width: Metres of the own vehicle.
+        vehicle_width: Metres of the own vehicle, where the camera's file does not tell it.
         departure_begin: Metres between the vehicle's side and the line, at less than which a departure begins.
         departure_end: At more than which it ends.
         drift: Radians that the vehicle must point towards the line for a departure to begin.

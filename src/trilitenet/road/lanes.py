@@ -47,11 +47,13 @@ class VanishingPoint(NamedTuple):
         u: Column in pixels.
         v: Row in pixels.
         error: One standard deviation of the row in pixels.
+        lines: How many lines tell it.
     """
 
     u: float
     v: float
     error: float
+    lines: int
 
 
 @dataclasses.dataclass
@@ -345,7 +347,7 @@ def vanishing_point(
     missed = basis @ (u, v) - a
     noise = max(1.0, float(np.sum(w * missed**2)) / max(len(b) - 2, 1))
     error = math.sqrt(noise * float(np.linalg.inv(normal)[1, 1]))
-    return VanishingPoint(float(u), float(v), error)
+    return VanishingPoint(float(u), float(v), error, len(b))
 
 
 def assign_positions(lines: Sequence[LaneLine], where: Sequence[float | None]) -> list[LaneLine]:

@@ -18,12 +18,14 @@ from trilitenet.road.events import EventDetector, EventThresholds
 from trilitenet.road.lanes import assign_positions, find_lines, vanishing_point
 from trilitenet.road.structures import Estimate, LaneLine, Road
 from trilitenet.road.tracking import LineTracker
-from trilitenet.structures import Perception
+from trilitenet.structures import Boxes, Perception
 
 __all__ = ["RoadMonitor"]
 
 _WIDTH_MEMORY: Final = 0.8
 """Seconds over which the lane's width is averaged."""
+_VEHICLES: Final = frozenset({"vehicle", "car", "van", "truck", "lorry", "bus"})
+"""Classes whose boxes are as wide as a lane's vehicles."""
 _WIDENING: Final = 0.05
 """Metres that a lane's width wanders in a second while it is not seen."""
 
@@ -33,7 +35,7 @@ class RoadMonitor:
 
     Args:
         camera: The camera, for any resolution of its view; estimated from the lanes if left out.
-        thresholds: When events begin and end.
+        thresholds: When events begin and end; the vehicle's width is the camera's, where that has one.
         field_of_view: Assumed horizontal field of view in degrees, without a camera.
         lane_width: Assumed width of a lane in metres, without a camera.
         still: This is a single picture.
@@ -56,6 +58,9 @@ class RoadMonitor:
         self._given = camera
         self._assumed = (field_of_view, lane_width)
         self._still = still
+        thresholds = thresholds or EventThresholds()
+        if camera is not None and camera.vehicle_width is not None:
+            thresholds = dataclasses.replace(thresholds, vehicle_width=camera.vehicle_width)
         self._events = EventDetector(thresholds)
         self._lane = LaneFilter()
         self._lead = LeadFilter()
@@ -84,16 +89,18 @@ class RoadMonitor:
         drivable = () if perception.drivable is None else _outlines(perception.drivable)
         if self._lines is not None:
             lines = self._lines.update(lines)
+        by_column = assign_positions(lines, [_column_right(line, perception.size) for line in lines])
+        if self._calibration is not None and self._still:
+            self._calibration.update(by_column, timestamp, _vehicles(perception))
         camera, errors, calibrated = self._trusted(lines)
         if camera is None:
-            lines = assign_positions(lines, [_column_right(line, perception.size) for line in lines])
-            if self._calibration is not None:
-                self._calibration.update(lines, timestamp)
-            return self._with_events(Road(tuple(lines), drivable), perception, timestamp)
+            if self._calibration is not None and not self._still:
+                self._calibration.update(by_column, timestamp, _vehicles(perception))
+            return self._with_events(Road(tuple(by_column), drivable), perception, timestamp)
         lines = [dataclasses.replace(line, ground=ground_curve(line, camera)) for line in lines]
         lines = assign_positions(lines, [_metres_right(line) for line in lines])
-        if self._calibration is not None:
-            self._calibration.update(lines, timestamp)
+        if self._calibration is not None and not self._still:
+            self._calibration.update(lines, timestamp, _vehicles(perception))
         distances = () if perception.boxes is None else find_distances(perception.boxes, camera, errors)
         road = Road(tuple(lines), drivable, camera=camera, calibrated=calibrated, distances=distances)
         usual = CameraErrors() if self._calibration is None else self._calibration.errors
@@ -131,9 +138,6 @@ class RoadMonitor:
         else:
             calibration = self._calibration
             assert calibration is not None
-            if self._still:
-                where = [_column_right(line, calibration.size) for line in lines]
-                calibration.update(assign_positions(lines, where), 0.0)
             if calibration.camera is None:
                 return None, CameraErrors(), None
             camera, errors = calibration.camera, calibration.errors
@@ -180,6 +184,9 @@ class RoadMonitor:
         lane = fit.lane if self._still else self._lane.update(fit, timestamp)
         if lane.width is None and lane.offset is not None:
             lane = dataclasses.replace(lane, width=self._known_width(timestamp))
+        if lane.offset is not None:
+            middle = Estimate(lane.offset.value - camera.left, lane.offset.error)
+            lane = dataclasses.replace(lane, offset=middle)
         return dataclasses.replace(road, ego_lane=lane, lead=lead)
 
     def _with_events(self, road: Road, perception: Perception, timestamp: float) -> Road:
@@ -187,6 +194,16 @@ class RoadMonitor:
             return road
         events = self._events.update(road, timestamp, perception.frame)
         return dataclasses.replace(road, events=events, warnings=self._events.warnings)
+
+
+def _vehicles(perception: Perception) -> Boxes | None:
+    """Return the boxes of vehicles: a model of one's own may find other things, too."""
+    boxes = perception.boxes
+    if boxes is None:
+        return None
+    classes = [number for number, name in enumerate(perception.class_names) if name.lower() in _VEHICLES]
+    keep = np.isin(boxes.class_id, classes)
+    return Boxes(boxes.xyxy[keep], boxes.confidence[keep], boxes.class_id[keep])
 
 
 def _outlines(mask: NDArray[np.bool_]) -> tuple[NDArray[np.float32], ...]:

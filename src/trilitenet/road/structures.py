@@ -116,6 +116,8 @@ class LaneLine:
             "id": self.id,
             "position": self.position,
             "points": np.round(self.points.astype(np.float64), 1).tolist(),
+            "polynomial": [float(f"{p:.6g}") for p in self.polynomial],
+            "origin": [round(value, 2) for value in self.origin],
             "residual": round(self.residual, 3),
             "confidence": round(self.confidence, 3),
             "ground": None if self.ground is None else self.ground.to_dict(),
@@ -130,7 +132,7 @@ class EgoLane:
 
     Attributes:
         width: Metres; None with only one line of the lane in sight.
-        offset: Metres the camera is left of the lane's centre.
+        offset: Metres the vehicle's middle is left of the lane's centre; the lens is, unless the camera has ``left``.
         heading: Radians the vehicle points to the left of the lane.
         curvature: 1/m of the lane where the vehicle is, positive when it bends to the left.
     """
@@ -152,7 +154,7 @@ class LeadVehicle:
     Attributes:
         box: Its index among the perception's boxes.
         track_id: Its identity over frames; -1 where unknown.
-        distance: Metres from the camera to its rear.
+        distance: Metres from the own front bumper to its rear; from the lens, unless the camera has ``front``.
         closing_speed: m/s that the distance shrinks by; None until enough frames were seen.
         time_to_collision: Seconds at the closing speed; None unless it is surely closing.
     """
@@ -218,7 +220,8 @@ class Road:
         lead: The vehicle ahead; None without one, or where its distance cannot be trusted.
         camera: The camera that metres rest on; None while there is none to trust.
         calibrated: ``"file"`` = the camera was given, ``"lanes"`` = estimated from the lanes' vanishing point.
-        distances: Metres to each of the perception's boxes, None for one whose distance cannot be told.
+        distances: Metres to each of the perception's boxes, from where the lead's is told, None for one whose distance
+            cannot be told.
         events: What began or ended in this frame.
         warnings: Kinds of events that are on.
     """

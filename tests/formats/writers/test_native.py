@@ -86,6 +86,10 @@ def test_the_road_follows_the_schema(
         assert document["road"]["lines"] == known.to_dict()["lines"]
     document["road"]["events"] = [{"kind": "lane_departure_up"}]
     assert not validator.is_valid(document)
+    for key, value in (("polynomial", [0.0] * 4), ("origin", [119.0])):
+        document = to_document(pictures[0], road.to_dict())
+        document["road"]["lines"][0][key] = value
+        assert not validator.is_valid(document)
 
 
 def test_the_schema_describes_every_key(pictures: list[Perception], road: Road) -> None:
