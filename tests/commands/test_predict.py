@@ -30,8 +30,8 @@ from trilitenet.errors import BackendError, ConfigError, InputError, MissingExtr
 from trilitenet.formats.writers.native import JsonWriter
 from trilitenet.formats.writers.yolo import YoloWriter
 from trilitenet.inference.predictor import Predictor
-from trilitenet.inference.sources import Clip, VideoReader
-from trilitenet.inference.video import VideoWriter
+from trilitenet.inference.sources import Clip, StreamReader, VideoReader
+from trilitenet.inference.video import PerceptionStream, VideoWriter
 from trilitenet.models.trilitenet import build_network
 from trilitenet.models.weights import save_network
 from trilitenet.processing.geometry import Camera
@@ -526,6 +526,43 @@ def test_the_mark_of_a_video_that_failed_is_there_before_its_results(
     assert {path.name for path in output.glob("*.part")} == {"a.unfinished.part"}
 
 
+def test_a_stream_that_is_lost_is_a_failure_and_what_came_is_marked_unfinished(
+    tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lost(self: StreamReader, *_: object) -> Iterator[Any]:
+        for number in range(3):
+            yield number / 10, functools.partial(coloured_scene, 90, 160)
+        raise InputError(f"{self.name}: given up after 8 attempts (the stream ended)")
+
+    monkeypatch.setattr(StreamReader, "_decode", lost)
+    sources: list[str | Path] = ["rtsp://127.0.0.1/live", drive(tmp_path / "drive.mp4")]
+    output = tmp_path / "out"
+    report = predict_with(predictor, sources, output)
+    assert [failure.reason for failure in report.failures] == [
+        "rtsp://127.0.0.1/live: given up after 8 attempts (the stream ended)"
+    ]
+    assert (report.exit_code, report.videos) == (1, 2)
+    assert report.dropped + report.frames == 3 + 12
+    frames = json.loads((output / "live.json").read_text())["frames"]
+    assert len(frames) == report.frames - 12 > 0
+    assert {path.name for path in output.glob("*.part")} == {"live.unfinished.part"}
+    assert predict_with(predictor, sources, output, skip_existing=True).skipped == 1
+
+
+def test_frames_that_were_left_out_are_told(
+    tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = drive(tmp_path / "drive.mp4", frames=2)
+    for dropped, told in (
+        (0, "frames at"),
+        (1, "frames, 1 frame left out, at"),
+        (28, "frames, 28 frames left out, at"),
+    ):
+        monkeypatch.setattr(PerceptionStream, "dropped", dropped)
+        report = predict_with(predictor, [source], tmp_path / str(dropped))
+        assert report.summary().startswith(f"1 video of 2 {told} ")
+
+
 def test_a_file_of_all_sources_is_marked_until_it_has_them_all(
     folder: Path, tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -646,9 +683,41 @@ def test_mistakes_are_named_before_anything_is_written(tmp_path: Path, predictor
         predict_with(predictor, [folder], output, format=("cocoo",))
     with pytest.raises(InputError, match="no source"):
         predict_with(predictor, [], output)
+    with pytest.raises(ConfigError, match="--hide lines above would change nothing: that is for --road"):
+        predict_with(predictor, [folder], output, hide=("lines", "labels", "above"))
+    with pytest.raises(ConfigError, match="--hide would change nothing: with --no-overlay nothing is drawn"):
+        predict_with(predictor, [folder], output, hide=("labels",), overlay=False)
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputError, match="is a file"):
         predict_with(predictor, [folder], tmp_path / "file")
+
+
+def test_options_for_videos_alone_are_told_where_there_is_none(
+    tmp_path: Path, predictor: Predictor, caplog: pytest.LogCaptureFixture
+) -> None:
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    Image.fromarray(coloured_scene(90, 160)).save(pictures / "a.png")
+    numbers = itertools.count()
+
+    def told(*sources: str | Path, **options: Any) -> list[str]:
+        caplog.clear()
+        predict_with(predictor, sources, tmp_path / str(next(numbers)), format="jsonl", overlay=False, **options)
+        return [record.getMessage() for record in caplog.records]
+
+    options = {"clip": Clip(every=2, max_frames=5), "road": RoadOptions(track=True, smoothing=0.5)}
+    idle = "--every and --max-frames and --track and --smoothing without effect: no source is a video"
+    rate = "--rate without effect: no source is numbered pictures, such as frames/%06d.jpg"
+    assert told(pictures) == told(pictures, clip=Clip(every=1), rate=30) == []
+    assert told(pictures, rate=10, **options) == [idle, rate]
+    assert told(pictures, shard="0/2", **options) == [idle]
+    assert told(pictures, shard="1/2", **options) == []
+    assert told(pictures, tmp_path / "absent.mp4", **options) == []  # which is told itself
+    assert told(tmp_path / "absent.mp4", **options) == []
+    drive(pictures / "drive.mp4", frames=2)
+    assert told(pictures, rate=10, **options) == [rate]
+    Image.fromarray(coloured_scene(90, 160)).save(pictures / "0.png")
+    assert told(str(pictures / "%d.png"), rate=10, **options) == []
 
 
 @pytest.mark.parametrize("format", ["scalabel", "openlabel", "coco", "yolo", "cvat", "csv"])

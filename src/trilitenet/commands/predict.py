@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import functools
 import json
+import logging
 import os
 import re
 import time
@@ -37,7 +38,15 @@ from trilitenet.errors import (
 )
 from trilitenet.formats.writers.base import Writer, file_stem, find_writer, open_writer, uninterrupted
 from trilitenet.inference.predictor import Predictor
-from trilitenet.inference.sources import Clip, Failure, FrameReader, Stills, find_sources, silent_opencv
+from trilitenet.inference.sources import (
+    Clip,
+    Failure,
+    FrameReader,
+    SequenceReader,
+    Stills,
+    find_sources,
+    silent_opencv,
+)
 from trilitenet.inference.video import PerceptionStream, VideoWriter
 from trilitenet.processing.drawing import PARTS, check_parts, draw
 from trilitenet.processing.geometry import Camera
@@ -50,10 +59,13 @@ from trilitenet.structures import Perception
 
 __all__ = ["PredictReport", "RoadOptions", "predict", "predict_with"]
 
+_LOGGER: Final = logging.getLogger(__name__)
 _HEAD: Final = 65536
 """Bytes of a JSON file in which its source is named, though the file may be as long as a video."""
 _JPEG_QUALITY: Final = 92
 """Of overlays on pictures, of 100."""
+_RATE: Final = 30.0
+"""Frames a second of numbered pictures, unless others are asked for."""
 _MOST_BARS: Final = 10
 """Of more sources than these, only the bar of the one at hand is shown, below that of all."""
 
@@ -66,7 +78,7 @@ class RoadOptions:
         measure: Lanes as curves, and, with a camera, metres; done with a camera file in any case.
         camera: A camera file (see `trilitenet.road.camera.read_camera`); estimated from the lanes if None.
         track: Give vehicles identities.
-        smoothing: Weight of the past in the masks, in [0, 1).
+        smoothing: How much masks are averaged over time, in [0, 1).
         field_of_view: Horizontal field of view in degrees that is assumed without a camera file; 60 if None.
         lane_width: Metres between the lines of a lane, likewise; 3.5 if None.
     """
@@ -97,9 +109,14 @@ class RoadOptions:
         steady = None
         if not still and (self.track or self.smoothing):
             steady = Steady(track=self.track, smoothing=self.smoothing)
-        if not self.measure and self._mounted is None:
+        if not self.wanted:
             return steady, None
         return steady, RoadMonitor(self._mounted, still=still, **assumed)
+
+    @property
+    def wanted(self) -> bool:
+        """Whether the road is looked at."""
+        return self.measure or self.camera is not None
 
     @functools.cached_property
     def _mounted(self) -> Camera | None:
@@ -122,6 +139,7 @@ class PredictReport:
         interrupted: Whether it was stopped by Ctrl-C; what was written until then is whole.
         skipped: Sources that were left out because their results exist.
         partial: Files of all sources together that hold some of them alone, for it was interrupted.
+        dropped: Frames of live sources that were left out, as there was no time for them.
     """
 
     images: int
@@ -134,6 +152,7 @@ class PredictReport:
     interrupted: bool = False
     skipped: int = 0
     partial: tuple[Path, ...] = ()
+    dropped: int = 0
 
     @property
     def exit_code(self) -> int:
@@ -155,7 +174,10 @@ class PredictReport:
                 f"{self.videos} video{'s' * (self.videos != 1)} of {self.frames} frame{'s' * (self.frames != 1)}"
             )
         speed = (self.images + self.frames) / max(self.seconds, 1e-9)
-        what = f"{', '.join(done)} at {speed:.1f} a second -> {self.output}" if done else "nothing was predicted"
+        dropped = f", {self.dropped} frame{'s' * (self.dropped != 1)} left out," if self.dropped else ""
+        what = (
+            f"{', '.join(done)}{dropped} at {speed:.1f} a second -> {self.output}" if done else "nothing was predicted"
+        )
         skipped = f"; {self.skipped} skipped, done already" if self.skipped else ""
         failed = f"; {len(self.failures)} failed" if self.failures else ""
         names = " and ".join(path.name for path in self.partial)
@@ -183,7 +205,7 @@ def predict(
     start: float = 0.0,
     end: float | None = None,
     max_frames: int | None = None,
-    rate: float = 30.0,
+    rate: float = _RATE,
     long_side: int | None = None,
     batch_size: int = 4,
     preview: bool = False,
@@ -234,7 +256,8 @@ def predict(
         camera: Camera file (YAML) for --road, which it turns on; without it, the camera is estimated from the lanes of
             a video.
         track: Give vehicles an identity over the frames of a video.
-        smoothing: Weight of the past in a video's masks, from 0 (none) to below 1.
+        smoothing: Average a video's masks over time so that they flicker less, from 0 (not at all) to below 1; what
+            moves lags by 1 frame up to 0.4, 2 frames at 0.5, 4 at 0.7, 13 at 0.9.
         field_of_view: For --road without a camera file: the lens's horizontal field of view in degrees; 60 if left out.
             Many dash-cams have 100 to 140; that lenses bend the edges of pictures takes a camera file.
         lane_width: For --road without a camera file: metres between the lines of a lane; 3.5 if left out.
@@ -288,7 +311,7 @@ def predict_with(
     overwrite: bool = False,
     skip_existing: bool = False,
     shard: str | None = None,
-    rate: float = 30.0,
+    rate: float = _RATE,
     preview: bool = False,
     quiet: bool = True,
     road: RoadOptions | None = None,
@@ -333,7 +356,7 @@ class _Job:
         preview: bool,
         road: RoadOptions,
     ) -> None:
-        check_parts(hide, PARTS + ROAD_PARTS)
+        _check_hide(hide, drawn=overlay or preview, road=road.wanted)
         if overwrite and skip_existing:
             raise ConfigError("--skip-existing and --overwrite exclude each other; choose one")
         if not sources:
@@ -346,6 +369,8 @@ class _Job:
         self.clip = clip
         part = _parse_shard(shard)
         self.sources, self.failures = find_sources(sources, clip, rate=rate, unopened=True)
+        if part is None or part[0] == 0:
+            self._tell_idle_options(rate)
         self.formats = tuple(dict.fromkeys(formats))
         self.overwrite = overwrite or skip_existing  # then what exists is of a source that is done anew
         self.names = self._left()
@@ -357,11 +382,24 @@ class _Job:
         self._check_output()
         self._check_formats()
         self.writers: list[Writer] = []
-        self.images = self.videos = self.frames = 0
+        self.images = self.videos = self.frames = self.dropped = 0
         self.files: list[Path] = []
         self.unfinished: dict[str, bool] = {}
         self.marked = self.whole = self.endless = False
         self.gathered = [self.output / file for file, holds in self._shared() if holds]
+
+    def _tell_idle_options(self, rate: float) -> None:
+        """Warn of options for videos alone where there is none, not even among what cannot be used."""
+        if not self.sources or self.failures:
+            return
+        fields = dataclasses.fields(Clip)
+        idle = [field.name for field in fields if getattr(self.clip, field.name) != field.default]
+        idle += [name for name in ("track", "smoothing") if getattr(self.road, name)]
+        if idle and not any(isinstance(source, FrameReader) for source in self.sources):
+            names = " and ".join(f"--{name.replace('_', '-')}" for name in idle)
+            _LOGGER.warning("%s without effect: no source is a video", names)
+        if rate != _RATE and not any(isinstance(source, SequenceReader) for source in self.sources):
+            _LOGGER.warning("--rate without effect: no source is numbered pictures, such as frames/%06d.jpg")
 
     def _leave_out_long_names(self) -> None:
         """Make a source whose results would have longer names than file systems take a failure of its own."""
@@ -561,6 +599,7 @@ class _Job:
             interrupted=interrupted,
             skipped=self.skipped,
             partial=tuple(self.gathered) if self.marked and not self.whole else (),
+            dropped=self.dropped,
         )
 
     def _run_source(self, source: Stills | FrameReader, predictor: Predictor, progress: Progress) -> None:
@@ -614,6 +653,8 @@ class _Job:
                 assert isinstance(source, FrameReader)
                 self.failures.append(Failure(source.name, str(error)))
                 self.videos -= self.frames == before
+            finally:
+                self.dropped += stream.dropped
         if video is not None and video.frames:
             self.files.append(video.path)
         progress.update(task, total=next(bar.completed for bar in progress.tasks if bar.id == task))
@@ -660,11 +701,28 @@ class _Job:
 
 
 def _follow(perception: Perception, parts: tuple[Steady | None, RoadMonitor | None]) -> tuple[Perception, Road | None]:
-    """Return a perception with what its video adds to it, and its road."""
+    """Return a perception with what its video adds to it, and its road, which smoothed masks would blur in time."""
     steady, monitor = parts
+    drivable, lane = perception.drivable, perception.lane
     if steady is not None:
         perception = steady(perception)
-    return perception, None if monitor is None else monitor(perception)
+    if monitor is None:
+        return perception, None
+    return perception, monitor(dataclasses.replace(perception, drivable=drivable, lane=lane))
+
+
+def _check_hide(hide: Sequence[str], *, drawn: bool, road: bool) -> None:
+    """Check which parts of the overlay are to be left out.
+
+    Raises:
+        ConfigError: If one does not exist, or would not be drawn anyway.
+    """
+    check_parts(hide, PARTS + ROAD_PARTS)
+    if hide and not drawn:
+        raise ConfigError("--hide would change nothing: with --no-overlay nothing is drawn")
+    idle = [part for part in hide if part in ROAD_PARTS]
+    if idle and not road:
+        raise ConfigError(f"--hide {' '.join(idle)} would change nothing: that is for --road")
 
 
 def _read_list(path: StrPath) -> list[str]:

@@ -322,7 +322,9 @@ class StreamReader(FrameReader):
 
     After a break it waits ``backoff`` seconds, then twice as long each time, up to ``longest``; a frame that arrives
     starts the count anew. Time stamps go on over a break by the clock, or after the last frame if that is later. Those
-    of a stream that has none (JPEGs of a network camera, H.264 as such) are the clock's.
+    of a stream that has none (JPEGs of a network camera, H.264 as such) are the clock's. A playlist that has an end by
+    then is over; any other stream that does not come back is lost: after the frames that came, iterating raises
+    `InputError`.
 
     Args:
         url: The address.
@@ -366,6 +368,8 @@ class StreamReader(FrameReader):
             attempt += 1
             try:
                 with _open_container(self._url, self.name, timeout=_PATIENCE, live=True) as container:
+                    if connected and container.format.name in _PLAYLISTS and _has_end(container):
+                        return  # the sender wrote the end, and it would begin anew
                     offset: float | None = None
                     timeless = bool(container.format.flags & _NO_TIMESTAMPS)
                     step = 0.0 if timeless else _step(container, self)
@@ -384,7 +388,7 @@ class StreamReader(FrameReader):
                 if not connected and attempt == 1:
                     raise
                 reason = str(error).removeprefix(f"{self.name}: ")
-        _LOGGER.warning("%s: given up after %d attempts (%s)", self.name, self.retries, reason)
+        raise InputError(f"{self.name}: given up after {self.retries} attempts ({reason})")
 
 
 class _UrlReader(VideoReader, StreamReader):

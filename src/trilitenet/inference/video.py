@@ -130,7 +130,8 @@ class PerceptionStream(Generic[T]):
 
     It gives a `Perception` for each frame of a video; for each picture that, or a `Failure` if it cannot be used.
     Use it as a context manager, so that the threads end with the block. A live source never piles up: frames that come
-    while the network is busy are left out.
+    while the network is busy are left out. Of a video that cannot be read to its end, such as a stream or a camera that
+    is lost, what came before is given first; then iterating raises `InputError`.
 
     Args:
         source: Pictures, or the frames of a video.
