@@ -3,6 +3,9 @@
 #   docker build --tag trilitenet .
 #   docker run --rm --publish 127.0.0.1:8000:8000 --read-only --tmpfs /tmp trilitenet
 #
+# An artefact or weights of the folder it is called in: --volume "$PWD":/models:ro before the image's name, and after it
+# --model /models/tiny.xml. Another port: --publish 127.0.0.1:9000:8000; HEALTHCHECK asks 8000, so leave --port alone.
+#
 # On a GPU: --build-arg TORCH_INDEX= the index of a CUDA build of PyTorch, and docker run --gpus all.
 
 ARG PYTHON=3.12-slim-bookworm

@@ -1,14 +1,74 @@
 from __future__ import annotations
 
+import dataclasses
 import shutil
+import types
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
+import trilitenet
+from tests.artefacts import Artefacts
+from tests.test_readme import ROOT, blocks
 from trilitenet.commands import export as command
 from trilitenet.commands.export import Exported, export
 from trilitenet.errors import BackendError, OutputError
+from trilitenet.models.weights import load_network, save_network
+
+
+class _Client:
+    """Answers as Triton does: the configuration of a model as JSON, and its graph on ONNX Runtime."""
+
+    folder: Path
+
+    def __init__(self, _url: str) -> None:
+        pass
+
+    def get_model_config(self, name: str) -> dict[str, Any]:
+        from tests.deploy.test_triton import parse_config, triton_schema
+
+        json_format = pytest.importorskip("google.protobuf.json_format")
+        config = parse_config(triton_schema(), self.folder / name)
+        mapping: dict[str, Any] = json_format.MessageToDict(config, preserving_proto_field_name=True)
+        return mapping
+
+    def infer(self, name: str, inputs: list[Any]) -> Any:
+        (image,) = inputs
+        pixels = np.frombuffer(image._get_binary_data(), {"UINT8": np.uint8, "FP32": np.float32}[image.datatype()])
+        session = pytest.importorskip("onnxruntime").InferenceSession(self.folder / name / "1" / "model.onnx")
+        values = session.run(None, {image.name(): pixels.reshape(image.shape())})
+        outputs = dict(zip([output.name for output in session.get_outputs()], values, strict=True))
+        return types.SimpleNamespace(as_numpy=outputs.get)
+
+
+@pytest.mark.parametrize("options", [{}, {"nms": True}, {"bgr": True, "masks": "probability"}], ids=str)
+def test_the_documented_client_gets_what_a_predictor_gives(
+    artefacts: Artefacts, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: Any
+) -> None:
+    triton = pytest.importorskip("tritonclient.http")
+    if "bgr" not in options:  # that and the masks are traced
+        request.getfixturevalue("traced")
+    network = load_network(artefacts.folder / "weights.safetensors")
+    thresholds = dataclasses.replace(network.card.thresholds, confidence=0.004)  # it is sure of nothing
+    weights = tmp_path / "tiny.safetensors"
+    save_network(network, weights, dataclasses.replace(network.card, thresholds=thresholds))
+    exported = export(weights, format="triton", output=tmp_path, size="64x128", **options)
+    pixels = np.random.default_rng(0).integers(0, 256, (90, 160, 3), np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "photo.jpg")
+    wanted = trilitenet.load(exported.path / "1" / "model.onnx", backend="onnxruntime")(tmp_path / "photo.jpg")
+    assert len(wanted.boxes or ()) > 5
+    assert wanted.drivable is not None
+    assert 0 < wanted.drivable.mean() < 1
+    (code,) = [block for block in blocks(ROOT / "docs" / "serving.md", "python") if "get_model_config" in block]
+    monkeypatch.setattr(_Client, "folder", tmp_path, raising=False)
+    monkeypatch.setattr(triton, "InferenceServerClient", _Client)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(compile(code, "docs/serving.md, a client of Triton", "exec"), names)
+    assert names["perception"].to_dict() == dict(wanted.to_dict(), source=None)
 
 
 def test_a_triton_repository_holds_a_checked_graph_and_the_card(traced: str, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilitenet.config import ModelCard
+from trilitenet.config import ARTEFACT_KEY, ArtefactInfo, ModelCard
 from trilitenet.deploy.triton import read_tensors, write_triton_repository
 from trilitenet.errors import OutputError, WeightsError
 
@@ -15,9 +15,8 @@ onnx = pytest.importorskip("onnx")
 text_format = pytest.importorskip("google.protobuf.text_format")
 
 
-@pytest.fixture(scope="module")
-def schema() -> Any:
-    """Triton's own definition of config.pbtxt, out of tritonclient, without the gRPC around it."""
+def triton_schema() -> Any:
+    """Return Triton's own definition of config.pbtxt, out of tritonclient, without the gRPC around it."""
     package = pytest.importorskip("tritonclient")
     path = Path(next(iter(package.__path__))) / "grpc" / "model_config_pb2.py"
     spec = importlib.util.spec_from_file_location("model_config_pb2", path)
@@ -28,8 +27,13 @@ def schema() -> Any:
     return module
 
 
-def _artefact(path: Path) -> Path:
-    """A graph with an input and outputs like the network's."""
+@pytest.fixture(scope="module")
+def schema() -> Any:
+    return triton_schema()
+
+
+def _artefact(path: Path, info: ArtefactInfo | None = None) -> Path:
+    """A graph with an input, outputs and metadata like the network's."""
     helper = onnx.helper
     image = helper.make_tensor_value_info("image", onnx.TensorProto.UINT8, [1, 384, 640, 3])
     lane = helper.make_tensor_value_info("lane", onnx.TensorProto.UINT8, [1, 384, 640, 3])
@@ -38,19 +42,23 @@ def _artefact(path: Path) -> Path:
     nodes = [helper.make_node("Identity", ["image"], ["lane"]), helper.make_node("Identity", ["weight"], ["detection"])]
     listed = helper.make_tensor_value_info("weight", onnx.TensorProto.FLOAT, [1, 1, 6])  # as older graphs do
     graph = helper.make_graph(nodes, "network", [image, listed], [boxes, lane], [weight])
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9), path)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    helper.set_model_props(model, {ARTEFACT_KEY: (info or ArtefactInfo("onnx", size=(384, 640))).to_json()})
+    onnx.save(model, path)
     return path
 
 
-def _parse(schema: Any, model: Path) -> Any:
+def parse_config(schema: Any, model: Path) -> Any:
+    """Return the configuration of a model in a repository."""
     return text_format.Parse((model / "config.pbtxt").read_text(encoding="utf-8"), schema.ModelConfig())
 
 
 def test_the_config_says_what_the_artefact_is(tmp_path: Path, schema: Any) -> None:
     card = ModelCard("small", class_names=("car", 'a "quoted"\nname'), licence="frei, für alle")
-    artefact = _artefact(tmp_path / "x.onnx")
+    info = ArtefactInfo("onnx", "fp16", (384, 640), colour="bgr", masks="probability", mask_scale=2, nms=True)
+    artefact = _artefact(tmp_path / "x.onnx", info)
     model = write_triton_repository(artefact, tmp_path / "repository", card)
-    config = _parse(schema, model)
+    config = parse_config(schema, model)
     assert (config.name, config.backend, config.max_batch_size) == ("trilitenet_small", "onnxruntime", 0)
     assert model.name == config.name
     (image,) = config.input
@@ -61,6 +69,7 @@ def test_the_config_says_what_the_artefact_is(tmp_path: Path, schema: Any) -> No
     ]
     assert config.instance_group[0].kind == schema.ModelInstanceGroup.KIND_AUTO
     assert ModelCard.from_json(config.parameters["trilitenet.card"].string_value, "x") == card
+    assert ArtefactInfo.from_json(config.parameters["trilitenet.artefact"].string_value, "x") == info
     assert (model / "1" / "model.onnx").read_bytes() == artefact.read_bytes()
 
 
@@ -108,6 +117,15 @@ def test_a_broken_graph_is_named(tmp_path: Path) -> None:
     broken.write_bytes(b"\xff\xfe\xfd no model")
     with pytest.raises(WeightsError, match="no ONNX model"):
         write_triton_repository(broken, tmp_path / "repository", ModelCard("tiny"))
+    assert not (tmp_path / "repository").exists()
+
+
+def test_a_graph_that_does_not_say_what_it_takes_is_refused(tmp_path: Path) -> None:
+    model = onnx.load(str(_artefact(tmp_path / "x.onnx")))
+    del model.metadata_props[:]
+    onnx.save(model, tmp_path / "x.onnx")
+    with pytest.raises(WeightsError, match=r"x\.onnx: no 'trilitenet\.artefact' in its metadata; export it with"):
+        write_triton_repository(tmp_path / "x.onnx", tmp_path / "repository", ModelCard("tiny"))
     assert not (tmp_path / "repository").exists()
 
 

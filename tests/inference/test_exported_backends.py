@@ -24,7 +24,7 @@ import trilitenet
 from tests.artefacts import SIZE, Artefacts, check_backend
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
 from trilitenet.errors import BackendError, ConfigError, ShapeError, WeightsError
-from trilitenet.inference.exported import ArtefactBackend, is_int8_onnx, prepare_input, read_metadata
+from trilitenet.inference.exported import ArtefactBackend, gather_outputs, is_int8_onnx, prepare_input, read_metadata
 from trilitenet.inference.ncnn_backend import NcnnBackend
 from trilitenet.inference.onnx_backend import OnnxBackend
 from trilitenet.inference.openvino_backend import OpenVINOBackend
@@ -431,6 +431,18 @@ def test_a_runtime_without_cuda_says_so(artefacts: Artefacts, monkeypatch: pytes
         OnnxBackend(artefacts.folder / "model.onnx", "cuda")
 
 
+@pytest.mark.filterwarnings("ignore:Specified provider")
+def test_cuda_that_does_not_start_is_not_the_cpu_in_silence(
+    artefacts: Artefacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = artefacts.folder / "model.onnx"
+    providers = ["CUDAExecutionProvider", "CPUExecutionProvider"]
+    monkeypatch.setattr("onnxruntime.get_available_providers", lambda: providers)  # as where cuDNN is missing
+    with pytest.raises(BackendError, match="could not start on CUDA"):
+        OnnxBackend(path, "cuda")
+    assert OnnxBackend(path).name == "onnxruntime cpu fp32"
+
+
 @pytest.mark.parametrize(("name", "runtime"), [("model.onnx", "onnxruntime"), ("model.xml", "openvino")])
 def test_prediction_needs_no_torch(artefacts: Artefacts, name: str, runtime: str) -> None:
     code = (
@@ -463,6 +475,39 @@ def test_input_forms() -> None:
     planes = prepare_input(image, ArtefactInfo("onnx", input="float_nchw"))
     assert planes.dtype == np.float32
     assert np.array_equal(planes[0].transpose(1, 2, 0), image)
+
+
+@pytest.mark.parametrize(
+    ("masks", "given", "wanted"),
+    [
+        ("decision", np.array([[0, 1]], np.uint8), [0, 255]),
+        ("probability", np.array([[0, 100]], np.uint8), [0, 100]),
+        ("logit", np.array([[-0.5, 0.25]], np.float32), [0, 255]),
+    ],
+)
+def test_masks_of_every_kind_become_probability(masks: Any, given: NDArray[Any], wanted: list[int]) -> None:
+    card, info = ModelCard("tiny", tasks=("lane",)), ArtefactInfo("onnx", masks=masks)
+    raw = gather_outputs([{"lane": given[None]}, {"lane": given[None]}], card, info)
+    assert raw.detection is None
+    assert raw.drivable is None
+    assert raw.lane is not None
+    assert raw.lane.tolist() == [[wanted], [wanted]]
+
+
+def test_results_that_lack_an_output_are_told() -> None:
+    results = [{"lane": np.zeros((1, 2, 2), np.uint8), "drivable": None}]
+    with pytest.raises(ShapeError, match="have no detection, drivable; ask the artefact for detection, drivable, lane"):
+        gather_outputs(results, ModelCard("tiny"), ArtefactInfo("onnx"))  # type: ignore[arg-type]
+
+
+def test_what_a_client_of_triton_imports_needs_no_runtime() -> None:
+    code = (
+        "import sys, trilitenet.inference.exported, trilitenet.processing.postprocess, trilitenet.processing.images\n"
+        "heavy = {'torch', 'onnx', 'onnxruntime', 'openvino'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr
 
 
 def test_images_of_different_numbers_of_boxes_share_a_batch() -> None:

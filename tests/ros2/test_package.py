@@ -245,6 +245,15 @@ def test_parameters_cannot_be_set_to_no_effect(node_module: Any, monkeypatch: py
     assert node_module.PerceptionNode().settable == set()
 
 
+def test_the_documented_topics_are_those_of_the_node(node_module: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trilitenet.load", lambda model, **options: Predictor(_Backend()), raising=False)
+    node = node_module.PerceptionNode()
+    text = (PACKAGE.parents[1] / "docs" / "serving.md").read_text(encoding="utf-8")
+    (table,) = re.findall(r"^\| Topic \|.*\n((?:\|.*\n)+)", text, re.MULTILINE)
+    documented = re.findall(r"`([^`]+)`", "".join(row.split("|")[1] for row in table.splitlines()))
+    assert documented == [*node.subscriptions, *node.publishers]
+
+
 def test_the_launch_file_takes_a_file_of_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, module in fakes.launch_modules(PACKAGE).items():
         monkeypatch.setitem(sys.modules, name, module)

@@ -1,19 +1,20 @@
 """A model repository for NVIDIA Triton from an exported ONNX graph: ``NAME/config.pbtxt`` and ``NAME/1/model.onnx``.
 
-Names, types and shapes in ``config.pbtxt`` are those of the artefact itself; class names, thresholds and normalisation
-travel as the model card in its parameter ``trilitenet.card``. Triton runs the network alone: letterboxing and
-post-processing stay with the client, which has both in `trilitenet.processing`.
+Names, types and shapes in ``config.pbtxt`` are those of the artefact itself; its parameters ``trilitenet.card`` and
+``trilitenet.artefact`` are the artefact's own metadata: classes and thresholds, order of colours and kind of masks.
+Triton runs the network alone: preparing the image and reading the outputs stay with the client, which finds what both
+take in `trilitenet.inference.exported` and `trilitenet.processing`.
 """
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from trilitenet.config import ModelCard
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ModelCard
 from trilitenet.errors import OutputError, WeightsError, folder_beside, import_extra, writing
 
 __all__ = ["TensorSpec", "read_tensors", "write_triton_repository"]
@@ -43,7 +44,7 @@ def write_triton_repository(
     The model is there whole or not at all, so that a server that watches the repository loads no half of it.
 
     Args:
-        artefact: An exported ``.onnx`` file.
+        artefact: An exported ``.onnx`` file, with its description in its metadata.
         folder: The repository; other models in it are left alone.
         card: The artefact's model card.
         name: Of the model; that of the variant if left out.
@@ -53,11 +54,15 @@ def write_triton_repository(
         The model's folder.
 
     Raises:
-        WeightsError: If the artefact is broken.
+        WeightsError: If the artefact is broken, or was not exported by this package.
         OutputError: If the model is in the repository already, or cannot be written.
         MissingExtraError: If onnx is not installed.
     """
-    inputs, outputs = read_tensors(artefact)
+    proto = _load(artefact)
+    metadata = {entry.key: entry.value for entry in proto.metadata_props}
+    if ARTEFACT_KEY not in metadata:
+        raise WeightsError(f"{artefact}: no {ARTEFACT_KEY!r} in its metadata; export it with: trilitenet export")
+    parameters = {CARD_KEY: card.to_json(), ARTEFACT_KEY: metadata[ARTEFACT_KEY]}
     model = folder / (name or f"trilitenet_{card.variant}")
     if model.exists() and not overwrite:
         raise OutputError(f"{model}: exists already; give another --output or --overwrite")
@@ -67,7 +72,7 @@ def write_triton_repository(
         _copy(model, made, without=("config.pbtxt", "1"))
         _copy(model / "1", made / "1", without=("model.onnx",))
         shutil.copyfile(artefact, made / "1" / "model.onnx")
-        (made / "config.pbtxt").write_text(_config(model.name, inputs, outputs, card), encoding="utf-8")
+        (made / "config.pbtxt").write_text(_config(model.name, *_tensors(proto.graph), parameters), encoding="utf-8")
         if model.exists():
             model.replace(former)
         made.replace(model)
@@ -92,11 +97,19 @@ def read_tensors(artefact: Path) -> tuple[list[TensorSpec], list[TensorSpec]]:
         WeightsError: If the file is broken.
         MissingExtraError: If onnx is not installed.
     """
+    return _tensors(_load(artefact).graph)
+
+
+def _load(artefact: Path) -> Any:
+    """Return an ``onnx.ModelProto``."""
     onnx = import_extra("onnx", "onnx")
     try:
-        graph = onnx.load(str(artefact), load_external_data=False).graph
+        return onnx.load(str(artefact), load_external_data=False)
     except Exception as error:  # protobuf's own error type is none that can be named here
         raise WeightsError(f"{artefact}: is no ONNX model ({error})") from error
+
+
+def _tensors(graph: Any) -> tuple[list[TensorSpec], list[TensorSpec]]:
     constants = {tensor.name for tensor in graph.initializer}
 
     def spec(value: Any) -> TensorSpec:
@@ -107,7 +120,7 @@ def read_tensors(artefact: Path) -> tuple[list[TensorSpec], list[TensorSpec]]:
     return [spec(v) for v in graph.input if v.name not in constants], [spec(v) for v in graph.output]
 
 
-def _config(name: str, inputs: list[TensorSpec], outputs: list[TensorSpec], card: ModelCard) -> str:
+def _config(name: str, inputs: list[TensorSpec], outputs: list[TensorSpec], parameters: Mapping[str, str]) -> str:
     lines = [
         f"name: {_quote(name)}",
         'backend: "onnxruntime"',
@@ -115,7 +128,10 @@ def _config(name: str, inputs: list[TensorSpec], outputs: list[TensorSpec], card
         *(_tensor("input", tensor) for tensor in inputs),
         *(_tensor("output", tensor) for tensor in outputs),
         "instance_group [ { kind: KIND_AUTO, count: 1 } ]",
-        f'parameters {{ key: "trilitenet.card" value {{ string_value: {_quote(card.to_json())} }} }}',
+        *(
+            f"parameters {{ key: {_quote(key)} value {{ string_value: {_quote(text)} }} }}"
+            for key, text in parameters.items()
+        ),
     ]
     return "\n".join(lines) + "\n"
 

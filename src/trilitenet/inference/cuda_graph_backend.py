@@ -138,7 +138,7 @@ class CudaGraphBackend:
                 network(pixels)
         torch.cuda.current_stream().wait_stream(side)
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # other threads may use the GPU meanwhile
             outputs = tuple(network(pixels))
         results = tuple(
             None if output is None else torch.empty(output.shape, dtype=output.dtype, pin_memory=True)

@@ -1,4 +1,4 @@
-"""What backends of exported artefacts share: their metadata, their input, and their outputs gathered."""
+"""What backends and clients of exported artefacts share: their metadata, their input, and their outputs gathered."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from trilitenet.errors import BackendError, ShapeError, TriLiteNetError, Weights
 from trilitenet.inference.backend import check_batch
 from trilitenet.structures import RawOutputs
 
-__all__ = ["ArtefactBackend", "check_graph", "is_int8_onnx", "prepare_input", "read_metadata"]
+__all__ = ["ArtefactBackend", "check_graph", "gather_outputs", "is_int8_onnx", "prepare_input", "read_metadata"]
 
 _METADATA_BYTES = 1 << 16
 
@@ -85,6 +85,13 @@ def is_int8_onnx(path: str | os.PathLike[str]) -> bool:
 def prepare_input(image: NDArray[np.uint8], info: ArtefactInfo) -> NDArray[Any]:
     """Turn (H, W, 3) uint8 RGB into the artefact's input for one image.
 
+    Args:
+        image: A letterboxed image, RGB whatever the artefact takes.
+        info: How the artefact takes it.
+
+    Returns:
+        (1, H, W, 3) uint8 or (1, 3, H, W) float32 of 0 .. 255, RGB or BGR, as ``info`` says.
+
     Raises:
         ShapeError: If the artefact is for another size.
     """
@@ -98,6 +105,42 @@ def prepare_input(image: NDArray[np.uint8], info: ArtefactInfo) -> NDArray[Any]:
     if info.input == "float_nchw":
         return np.ascontiguousarray(image.transpose(2, 0, 1)[None], np.float32)
     return np.ascontiguousarray(image[None])
+
+
+def gather_outputs(results: Sequence[Mapping[str, NDArray[Any]]], card: ModelCard, info: ArtefactInfo) -> RawOutputs:
+    """Turn what an artefact returned into what `to_perceptions` takes: masks of any kind become probability x 255.
+
+    Args:
+        results: For each image the name of each output -> array with a leading 1.
+        card: The artefact's card; its tasks are the outputs.
+        info: What the artefact's masks hold.
+
+    Raises:
+        ShapeError: If an output is missing.
+        WeightsError: If the card is of another graph.
+    """
+    missing = [task for task in card.tasks if any(result.get(task) is None for result in results)]
+    if missing:
+        raise ShapeError(f"the results have no {', '.join(missing)}; ask the artefact for {', '.join(card.tasks)}")
+
+    def mask(name: str) -> NDArray[np.uint8] | None:
+        if name not in card.tasks:
+            return None
+        return np.concatenate([_probability(result[name], info) for result in results])
+
+    detection = None
+    if "detection" in card.tasks:
+        rows = [np.asarray(result["detection"], np.float32) for result in results]
+        if any(row.shape[-1] != 5 + card.classes for row in rows):
+            raise WeightsError(
+                f"the card names {card.classes} classes, but the graph gives rows of {rows[0].shape[-1]} numbers, "
+                f"not {5 + card.classes}; the file is damaged"
+            )
+        rows = [row.reshape(-1, 5 + card.classes) for row in rows]
+        detection = np.zeros((len(rows), max(len(row) for row in rows), 5 + card.classes), np.float32)
+        for padded, row in zip(detection, rows, strict=True):  # after suppression, images have different counts
+            padded[: len(row)] = row
+    return RawOutputs(detection, mask("drivable"), mask("lane"))
 
 
 class ArtefactBackend(abc.ABC):
@@ -132,33 +175,14 @@ class ArtefactBackend(abc.ABC):
             BackendError: If the runtime fails.
             WeightsError: If the card is of another graph.
         """
-        card, info = self._card, self.info
-        check_batch(batch, MAX_STRIDE if info.size is None else 1)
+        check_batch(batch, MAX_STRIDE if self.info.size is None else 1)
         try:
             results = self._compute(batch)
         except TriLiteNetError:
             raise
         except Exception as error:  # what runtimes raise shares no base class
             raise BackendError(f"the runtime failed ({gist(error)})") from error
-
-        def mask(name: str) -> NDArray[np.uint8] | None:
-            if name not in card.tasks:
-                return None
-            return np.concatenate([_probability(result[name], info) for result in results])
-
-        detection = None
-        if "detection" in card.tasks:
-            rows = [np.asarray(result["detection"], np.float32) for result in results]
-            if any(row.shape[-1] != 5 + card.classes for row in rows):
-                raise WeightsError(
-                    f"the card names {card.classes} classes, but the graph gives rows of {rows[0].shape[-1]} numbers, "
-                    f"not {5 + card.classes}; the file is damaged"
-                )
-            rows = [row.reshape(-1, 5 + card.classes) for row in rows]
-            detection = np.zeros((len(rows), max(len(row) for row in rows), 5 + card.classes), np.float32)
-            for padded, row in zip(detection, rows, strict=True):  # after suppression, images have different counts
-                padded[: len(row)] = row
-        return RawOutputs(detection, mask("drivable"), mask("lane"))
+        return gather_outputs(results, self._card, self.info)
 
 
 def _probability(mask: NDArray[Any], info: ArtefactInfo) -> NDArray[np.uint8]:

@@ -55,6 +55,11 @@ class OnnxBackend(ParallelSessions, ArtefactBackend):
         check_graph(shapes, self._outputs, self._card, self.info, str(path))
         self._input = inputs[0].name
         self._device = "cuda" if self._session.get_providers()[0].startswith("CUDA") else "cpu"
+        if device == "cuda" and self._device != device:  # it goes on with the CPU, and says so on standard error alone
+            raise BackendError(
+                "ONNX Runtime could not start on CUDA; see that the driver, CUDA and cuDNN are those that this "
+                "onnxruntime-gpu is made for, or use device='cpu'"
+            )
 
     def _open(self, threads: int | None) -> Any:
         options = self._runtime.SessionOptions()

@@ -28,7 +28,8 @@ def to_perceptions(
     """Turn the raw outputs of a batch into one `Perception` an image, in pixels of the source images.
 
     Args:
-        raw: Outputs for B images.
+        raw: Outputs for B images, with masks as probability x 255. Those of an exported artefact are not (0 and 1, by
+            default): `trilitenet.inference.exported.gather_outputs` makes them so.
         letterboxes: How each of the B images was fitted into the canvas.
         thresholds: What counts as an object, as drivable and as lane.
         class_names: Names of the detection classes.
@@ -103,7 +104,7 @@ def threshold_mask(mask: NDArray[np.uint8], letterbox: Letterbox, threshold: flo
     """Decide each pixel of the source image.
 
     Args:
-        mask: (canvas height, canvas width) uint8, probability x 255.
+        mask: (canvas height, canvas width) uint8, probability x 255; where it was decided before, 0 or 255, not 1.
         letterbox: How the image was fitted into the canvas.
         threshold: True where the probability is above this, in [0, 1].
 

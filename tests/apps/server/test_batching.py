@@ -55,7 +55,7 @@ def canvas(value: int, size: int = 4) -> NDArray[np.uint8]:
     return np.full((size, size, 3), value, np.uint8)
 
 
-def value(result: tuple[RawOutputs, float, float]) -> int:
+def value(result: tuple[RawOutputs, float, float, int]) -> int:
     assert result[0].drivable is not None
     return int(result[0].drivable[0, 0, 0])
 
@@ -68,6 +68,7 @@ def test_what_gathers_while_the_network_runs_is_one_batch(network: Network, batc
     network.gate.set()
     assert [value(future.result(5)) for future in [first, *others]] == [0, 1, 2, 3, 4, 5]
     assert network.batches == [[0], [1, 2, 3], [4, 5]]
+    assert [future.result(5)[3] for future in others] == [3, 3, 3, 2, 2]
 
 
 def test_shapes_do_not_mix_and_the_oldest_goes_first(network: Network, batcher: Batcher) -> None:
@@ -153,7 +154,7 @@ def test_the_time_in_the_queue_and_that_in_the_network_are_told(monkeypatch: pyt
     future = batcher.submit(canvas(0), LATER)
     clock.now += 2
     batcher.start()
-    assert future.result(5)[1:] == (2.0, 3.0)
+    assert future.result(5)[1:] == (2.0, 3.0, 1)
     batcher.close(10)
 
 

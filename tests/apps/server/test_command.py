@@ -45,8 +45,10 @@ def _settings(server: Any) -> Settings:
 
 
 def test_flags_become_settings(started: list[Any], backend: FakeBackend) -> None:
-    assert cli.main(["serve", "--model", "runs/my.onnx", "--port", "0", "--queue", "5", "--deadline", "2"]) == 0
+    words = ["--model", "runs/my.onnx", "--port", "0", "--queue", "5", "--deadline", "2", "--upload-timeout", "90"]
+    assert cli.main(["serve", *words]) == 0
     (server,) = started
+    assert _settings(server).upload_timeout == 90.0
     assert (_settings(server).queue, _settings(server).max_images, _settings(server).deadline) == (5, 5, 2.0)
     assert server.config.app.service.name == "my"
     assert backend.closed
@@ -82,6 +84,7 @@ def test_mistakes_are_told_in_one_line(started: list[Any], tmp_path: Path, capsy
             (["--token-file", str(foreign)], "must be plain ASCII"),
             (["--queue", "0"], "queue must be at least 1"),
             (["--deadline", "-1"], "deadline must be positive and finite"),
+            (["--upload-timeout", "0"], "upload_timeout must be positive and finite"),
             (["--drain", "-1"], "drain must be at least 0 and finite"),
             (["--max-batch", "-1"], "max_batch must be at least 0"),
             (["--port", port], f"cannot listen on 127.0.0.1 port {port} (Address already in use); choose"),

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
+import itertools
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -17,7 +20,9 @@ import yaml
 from starlette.testclient import TestClient
 
 from tests.apps.server.conftest import MakeApp
+from tests.test_readme import lines
 from trilitenet.apps.cli import _repeated, build_app
+from trilitenet.apps.server.command import serve
 from trilitenet.apps.server.metrics import Metrics
 from trilitenet.apps.server.settings import Settings
 
@@ -48,6 +53,39 @@ def test_the_image_is_slim_not_root_and_watched() -> None:
     assert last.index("USER") < last.index("ENTRYPOINT")
     assert "HEALTHCHECK" in last
     assert "/healthz" in last
+
+
+def _words(instruction: str) -> list[str]:
+    """Return the words of an instruction of the Dockerfile's last stage, the last of that name."""
+    text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    words: list[str] = json.loads(re.findall(rf"^{instruction} (\[.*\])$", text, re.MULTILINE)[-1])
+    return words
+
+
+def test_models_that_the_documented_containers_serve_are_inside_them() -> None:
+    runs = [shlex.split(line) for line in lines(ROOT / "docs" / "serving.md") if line.startswith("docker run")]
+    models = []
+    for words in runs:
+        options, arguments = words[: words.index("trilitenet")], words[words.index("trilitenet") + 1 :]
+        asked = [*_words("ENTRYPOINT"), *(arguments or _words("CMD"))][1:]
+        bound = build_app(asked).parse_args(_repeated(asked), print_error=False, exit_on_error=False)[1]
+        model = bound.arguments["model"]
+        volumes = [value for name, value in itertools.pairwise(options) if name == "--volume"]
+        assert [Path(volume.split(":")[1]) for volume in volumes] == [Path(model).parent] * ("/" in model)
+        models.append(model)
+    assert models == ["tiny", "/models/tiny.xml"]
+    text = (ROOT / "compose.yaml").read_text(encoding="utf-8")
+    service = yaml.safe_load(text.replace("# volumes:", "volumes:"))["services"]["trilitenet"]
+    assert service["volumes"] == ["./models:/models:ro"]
+    assert service["command"] == ["--model", "${TRILITENET_MODEL:-tiny}"]
+
+
+def test_the_health_check_asks_the_port_that_is_served() -> None:
+    text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    assert "--port" not in (*_words("ENTRYPOINT"), *_words("CMD"))
+    port = inspect.signature(serve).parameters["port"].default
+    assert f"http://127.0.0.1:{port}/healthz" in text
+    assert f"EXPOSE {port}\n" in text
 
 
 def test_the_containers_of_compose_can_do_little() -> None:

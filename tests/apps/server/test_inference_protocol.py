@@ -15,11 +15,13 @@ import pytest
 from PIL import Image
 from starlette.testclient import TestClient
 
-from tests.apps.server.conftest import MakeApp, Running, encode, picture
-from trilitenet.apps.server.application import Application
+from tests.apps.server.conftest import FakeBackend, MakeApp, Running, encode, picture
+from trilitenet.apps.server.application import Application, create_app
 from trilitenet.apps.server.inference_protocol import _base64, _boxes, _parse
 from trilitenet.apps.server.problems import ProblemError
 from trilitenet.apps.server.settings import Settings
+from trilitenet.config import ArtefactInfo
+from trilitenet.inference.predictor import Predictor
 from trilitenet.structures import Boxes, Perception
 
 
@@ -56,6 +58,13 @@ def test_tritons_client_gets_right_answers(app: Application, run_app: Callable[[
         np.testing.assert_array_equal(result.as_numpy("lane")[0], expected[0].lane)
         with pytest.raises(triton.InferenceServerException, match="there is no model 'other'"):
             client.infer("other", [tensor])
+        # What the client sends by itself is passed over, and a parameter of ours reaches the boxes.
+        own = {"sequence_id": 3, "sequence_start": True, "sequence_end": True, "priority": 1, "timeout": 9}
+        counts = [
+            client.infer("tiny", [tensor], parameters={"confidence": value}, **own).as_numpy("boxes").shape[1]
+            for value in (0.05, 0.3, 0.6, 1)
+        ]
+        assert counts == [3, 2, 1, 0]
         job = client.async_infer("tiny", [tensor])
         np.testing.assert_array_equal(job.get_result().as_numpy("drivable")[0], expected[0].drivable)
     finally:
@@ -113,6 +122,12 @@ def test_plain_json_works(client: TestClient) -> None:
         ({**_tensor(), "outputs": [{"name": "x"}]}, 400, "unknown output 'x'"),
         ({**_tensor(), "outputs": [{"name": "boxes", "parameters": 5}]}, 400, "must be an object"),
         ({**_tensor(), "id": 3}, 400, "id must be"),
+        ({**_tensor(), "parameters": 5}, 400, "must be an object"),
+        (
+            {**_tensor(), "parameters": {"confidense": 0.5}},
+            400,
+            "unknown parameter 'confidense'; did you mean 'confidence'?",
+        ),
     ],
 )
 def test_malformed_requests_are_refused(client: TestClient, body: Any, status: int, message: str) -> None:
@@ -120,6 +135,14 @@ def test_malformed_requests_are_refused(client: TestClient, body: Any, status: i
     answer = client.post("/v2/models/tiny/infer", content=content)
     assert answer.status_code == status
     assert message in answer.json()["error"]
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.5, True, "0.5", [], float("nan")])
+def test_a_confidence_that_is_none_is_refused(client: TestClient, value: Any) -> None:
+    body = {**_tensor(), "parameters": {"confidence": value}}
+    answer = client.post("/v2/models/tiny/infer", content=json.dumps(body))
+    assert answer.status_code == 400
+    assert "confidence must be a number from 0 to 1" in answer.json()["error"]
 
 
 @pytest.mark.parametrize("length", ["5", "x", "-1", "0" * 20 + "9" * 4400])
@@ -356,6 +379,24 @@ def test_fewer_boxes_are_filled_up() -> None:
     box = Boxes(np.array([[1, 2, 3, 4]], np.float32), np.array([0.5], np.float32), np.array([0]))
     rows = _boxes([Perception((9, 9), boxes=box), Perception((9, 9), boxes=Boxes.empty())])
     assert rows.tolist() == [[[1, 2, 3, 4, 0.5, 0]], [[-1] * 6]]
+
+
+def test_confidence_replaces_the_threshold(client: TestClient) -> None:
+    def count(**asked: Any) -> int:
+        answer = client.post("/v2/models/tiny/infer", json={**_file(64, 48), **asked})
+        return int(answer.json()["outputs"][0]["shape"][1])
+
+    parameters: list[dict[str, Any]] = [{}, {"confidence": None}, {"confidence": 0.05}, {"confidence": 0.6}]
+    assert [count(parameters=each) for each in parameters] == [2, 2, 3, 1]
+    assert count(parameters=None) == 2
+
+
+def test_a_confidence_that_the_artefact_cannot_give_is_refused(backend: FakeBackend) -> None:
+    backend.info = ArtefactInfo("onnx", nms=True)  # type: ignore[attr-defined]
+    with TestClient(create_app(Predictor(backend), "tiny")) as client:
+        answer = client.post("/v2/models/tiny/infer", json={**_tensor(), "parameters": {"confidence": 0.01}})
+    assert answer.status_code == 422
+    assert "drops boxes below" in answer.json()["error"]
 
 
 def test_extensions_that_are_not_there_are_refused(client: TestClient) -> None:

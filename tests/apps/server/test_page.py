@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import os
 import shutil
@@ -18,6 +19,7 @@ import cv2
 import jsonschema
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 from selenium import webdriver
 from selenium.webdriver.common.by import By
@@ -466,14 +468,19 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return _write_clip(tmp_path_factory.mktemp("clip") / "drive.webm", frames=30, rate=10)
 
 
-def _write_clip(path: Path, frames: int, rate: float) -> Path:
+def _write_clip(path: Path, frames: int, rate: float, *, noise: int = 0) -> Path:
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"VP80"), rate, (320, 192))
     if not writer.isOpened():
         pytest.skip("this OpenCV cannot write WebM")
+    random = np.random.default_rng(0)
     for index in range(frames):
-        writer.write(np.full((192, 320, 3), 8 * index % 256, np.uint8))
+        writer.write(np.full((192, 320, 3), 8 * index % 256, np.uint8) + _noise(random, 192, 320, noise))
     writer.release()
     return path
+
+
+def _noise(random: np.random.Generator, height: int, width: int, most: int) -> NDArray[np.uint8]:
+    return random.integers(0, most, (height, width, 3), np.uint8, endpoint=True)
 
 
 def test_a_clip_is_seen_in_chunks_with_progress(page: Page, server: Running, clip: Path) -> None:
@@ -522,6 +529,29 @@ def test_a_clip_plays_at_its_speed_however_often_it_is_paused(page: Page, clip: 
     assert not any(page[name].is_enabled() for name in ("play", "seek"))  # which would change what is recorded
     page.downloaded("drive.webm")
     page.wait(lambda: page["play"].is_enabled() and page["seek"].is_enabled())
+
+
+def test_a_clip_is_saved_as_what_the_browser_records(page: Page, clip: Path) -> None:
+    page.script(
+        "document.getElementById('rate').value = '2'; window.MediaRecorder = class {"
+        "  static isTypeSupported(type) { return type === 'video/mp4'; }"
+        "  constructor(stream, options) {"
+        "    if (options?.mimeType !== 'video/mp4') throw new DOMException('', 'NotSupportedError');"
+        "    this.mimeType = 'video/mp4;codecs=avc1';"
+        "  }"
+        "  start() {}"
+        "  stop() { this.ondataavailable({ data: new Blob(['film']) }); this.onstop(); }"
+        "}; const real = URL.createObjectURL;"
+        "URL.createObjectURL = (blob) => { window.saved = blob.type; return real(blob); }"
+    )
+    page.choose(clip)
+    page.wait(lambda: page["save-clip"].is_displayed() and page["save-clip"].is_enabled())
+    page["save-clip"].click()
+    assert page.downloaded("drive.mp4").read_bytes() == b"film"
+    assert page.script("return window.saved") == "video/mp4"
+    page.script("MediaRecorder.isTypeSupported = () => false")
+    page.choose(clip)
+    page.wait(lambda: page["save-clip"].get_attribute("hidden"))
 
 
 def test_another_picture_ends_the_saving_of_a_clip(page: Page, clip: Path, photo: Path) -> None:
@@ -677,6 +707,106 @@ def test_a_huge_photo_is_made_smaller_before_it_is_sent(page: Page, tmp_path: Pa
     path.write_bytes(encode(picture(4000, 1000)))
     page.see(path)
     assert page.script("return document.getElementById('view').width") == 2560
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [{"max_pixels": 30_000}, {"max_side": 200}, {"max_body": 12_000}, {"max_pixels": 30_000, "max_body": 3_000}],
+)
+def test_pictures_are_sent_as_the_service_takes_them(browser: Page, tmp_path: Path, limits: dict[str, Any]) -> None:
+    app = create_app(Predictor(FakeBackend()), "tiny", Settings(threads=1, drain=0.1, **limits))
+    running = Running(app)
+    try:
+        browser.open(running.url)
+        path = tmp_path / "noisy.png"
+        Image.fromarray(_noise(np.random.default_rng(0), 300, 400, 255)).save(path)
+        assert browser.see(path).startswith("2 vehicles")
+        width, height = browser.script("const v = document.getElementById('view'); return [v.width, v.height]")
+        assert width * height <= app.service.settings.max_pixels
+        assert max(width, height) <= app.service.settings.max_side
+        assert width / height == pytest.approx(4 / 3, rel=0.02)
+        if "max_body" not in limits:
+            assert width * height > 28_000  # no smaller than must be
+        browser.choose(_write_clip(tmp_path / "noisy.webm", frames=20, rate=10, noise=255))
+        browser.wait(lambda: browser["player"].is_displayed() and not browser["progress-row"].is_displayed())
+        assert 9 <= int(browser["seek"].get_attribute("max")) + 1 <= 11
+        assert not browser["error"].is_displayed()
+        refused = [
+            sample
+            for metric in app.service.metrics.registry.collect()
+            for sample in metric.samples
+            if sample.name == "trilitenet_rejects_total" and sample.value
+        ]
+        assert refused == []
+    finally:
+        assert running.stop()
+
+
+def _refuse(page: Page, status: int, condition: str) -> None:
+    """Let requests whose `pictures` meet a condition be refused; `window.sent` takes the number and bytes of all."""
+    page.script(
+        "const [status] = arguments; const real = window.fetch; window.sent = [];"
+        "window.fetch = async (path, options) => {"
+        "  const { body } = options; const pictures = body instanceof FormData ? body.getAll('images') : [body];"
+        "  window.sent.push([pictures.length, pictures[0].size]);"
+        f"  if (!({condition})) return real(path, options);"
+        "  return new Response(JSON.stringify({ error: { message: 'too much' } }), { status });"
+        "}",
+        status,
+    )
+
+
+@pytest.mark.parametrize("status", [408, 413])
+def test_a_clip_that_is_too_much_at_once_is_sent_in_fewer_frames(page: Page, clip: Path, status: int) -> None:
+    _refuse(page, status, "pictures.length > 3")
+    page.choose(clip)
+    page.wait(lambda: page["player"].is_displayed() and not page["progress-row"].is_displayed())
+    frames = int(page["seek"].get_attribute("max")) + 1
+    counts = [count for count, _ in page.script("return window.sent")]
+    assert counts[:4] == [8, 4, 2, 2]
+    assert max(counts[2:]) == 2  # once is enough
+    assert sum(counts[2:]) == frames
+    assert not page["error"].is_displayed()
+
+
+@pytest.mark.parametrize("status", [408, 413])
+def test_a_photo_that_is_too_much_is_sent_smaller(page: Page, tmp_path: Path, status: int) -> None:
+    _refuse(page, status, "pictures[0].size > 150000")
+    path = tmp_path / "noisy.png"
+    Image.fromarray(_noise(np.random.default_rng(0), 300, 800, 255)).save(path)
+    assert page.see(path).startswith("2 vehicles")
+    sizes = [size for _, size in page.script("return window.sent")]
+    assert sizes[0] == path.stat().st_size
+    assert sizes[-1] <= 150_000
+    assert all(later <= earlier / 2 for earlier, later in itertools.pairwise(sizes))
+
+
+def test_a_photo_that_is_always_too_much_is_given_up(page: Page, photo: Path) -> None:
+    _refuse(page, 408, "true")
+    page.choose(photo)
+    page.wait(lambda: page["error"].text == "Too much.")
+    assert page["summary"].text == ""
+
+
+def test_the_times_of_a_clip_say_what_they_are_of(page: Page, clip: Path) -> None:
+    page.script(
+        "const real = Response.prototype.json; Response.prototype.json = async function () {"
+        "  const answer = await real.call(this); for (const one of answer.results ?? []) one.batch = 5; return answer;"
+        "}"
+    )
+    page.choose(clip)
+    page.wait(lambda: page["player"].is_displayed() and not page["progress-row"].is_displayed())
+    page.wait(lambda: page["seek-text"].text.startswith("1 /"))
+    rows = dict(row.text.rsplit(" ", 1) for row in page["timing"].find_elements(By.TAG_NAME, "tr"))
+    assert list(rows)[3:] == [
+        "network, for 5 pictures at once",
+        "postprocess",
+        "round trip of 8 frames",
+        "a frame's share",
+    ]
+    share = float(rows["a frame's share"])
+    assert share == pytest.approx(float(rows["round trip of 8 frames"]) / 8, abs=0.2)
+    assert abs(float(page["timing-total"].text.strip(": ms")) - share) <= 0.6
 
 
 def test_nothing_comes_from_elsewhere(page: Page, server: Running, photo: Path) -> None:

@@ -204,9 +204,13 @@ def test_bad_parameters_are_named(client: TestClient, jpeg: bytes, query: str) -
     [
         ("?confidenc=0.5", "unknown parameter 'confidenc'; did you mean 'confidence'?"),
         ("/batch?format=overlay", "unknown parameter 'format'; known: confidence"),
+        ("?format=json&confidence=0.3&format=masks", "format is given 2 times: give it once"),
+        ("/batch?confidence=0.3&confidence=0.3", "confidence is given 2 times: give it once"),
     ],
 )
-def test_parameters_that_are_not_known_are_refused(client: TestClient, jpeg: bytes, path: str, message: str) -> None:
+def test_parameters_that_are_not_known_or_given_twice_are_refused(
+    client: TestClient, jpeg: bytes, path: str, message: str
+) -> None:
     answer = client.post(f"/v1/predict{path}", content=jpeg)
     assert answer.status_code == 422
     assert (answer.json()["error"]["code"], answer.json()["error"]["message"]) == ("bad_parameter", message)
@@ -230,6 +234,16 @@ def test_models_shows_the_card(client: TestClient) -> None:
     assert model["card"]["licence"] == "MIT"
     assert (model["least_confidence"], model["max_images"]) == (0.0, 16)
     assert model["confidence"] == model["card"]["thresholds"]["confidence"]
+
+
+def test_models_tells_the_limits_that_a_client_can_heed(make_app: MakeApp) -> None:
+    limits = {"max_images": 3, "max_pixels": 5000, "max_side": 400, "max_body": 9000, "upload_timeout": 7.5}
+    app = make_app(**limits)
+    with TestClient(app) as client:
+        (model,) = client.get("/v1/models").json()["models"]
+    assert {name: model[name] for name in limits} == limits
+    example = app.api.openapi()["paths"]["/v1/models"]["get"]["responses"]["200"]["content"]["application/json"]
+    assert set(example["example"]["models"][0]) == set(model)
 
 
 def test_models_tells_the_confidence_that_is_served(backend: FakeBackend) -> None:
@@ -330,7 +344,8 @@ def test_the_schema_describes_every_route_with_examples(app: Application) -> Non
     Prediction.model_validate(predict["responses"]["200"]["content"]["application/json"]["example"])
     batch = schema["paths"]["/v1/predict/batch"]["post"]
     BatchPrediction.model_validate(batch["responses"]["200"]["content"]["application/json"]["example"])
-    assert "multipart/form-data" in predict["requestBody"]["content"]
+    taken = {"multipart/form-data", "image/jpeg", "image/png", "image/webp"}
+    assert set(predict["requestBody"]["content"]) == set(batch["requestBody"]["content"]) == taken
     assert "Retry-After" in predict["responses"]["503"]["headers"]
 
 
@@ -488,7 +503,8 @@ def test_the_schema_says_what_v2_answers(client: TestClient, backend: FakeBacken
                     assert ("ProtocolErrorAnswer" if path.startswith("/v2") else "/ErrorAnswer") in text
     assert "HTTPValidationError" not in json.dumps(schema)
     assert set(schema["paths"]["/metrics"]["get"]["responses"]["200"]["content"]) == {"text/plain"}
-    assert "503" in _documented(schema, "/v2/health/ready", "get")
+    for probe in ("live", "ready"):
+        assert "503" in _documented(schema, f"/v2/health/{probe}", "get")
     assert {"404", "503"} <= _documented(schema, "/v2/models/{model}/versions/{version}/ready", "get")
     path = "/v2/models/{model}/infer"
     cross = client.post("/v2/models/tiny/infer", headers={"sec-fetch-site": "cross-site"})
@@ -534,3 +550,14 @@ def test_milliseconds_are_milliseconds(client: TestClient, app: Application, bac
     answer = client.post("/v1/predict", content=jpeg).json()
     assert 50 <= answer["milliseconds"]["network"] < 50_000
     assert app.service.admission.seconds_each != 0.1  # learned from it
+
+
+def test_milliseconds_of_the_network_come_with_the_size_of_their_batch(
+    make_app: MakeApp, backend: FakeBackend, jpeg: bytes
+) -> None:
+    app = make_app(max_batch=3)
+    with TestClient(app) as client:
+        app.service._batcher._delay = 10.0  # until there are three
+        answer = client.post("/v1/predict/batch", files=[("images", ("a", jpeg))] * 3).json()
+    assert backend.batches[-1] == 3
+    assert [result["batch"] for result in answer["results"]] == [3, 3, 3]

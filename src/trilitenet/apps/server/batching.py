@@ -103,7 +103,7 @@ class _Item:
     canvas: NDArray[np.uint8]
     deadline: float
     entered: float
-    future: Future[tuple[RawOutputs, float, float]]
+    future: Future[tuple[RawOutputs, float, float, int]]
 
 
 class Batcher:
@@ -154,7 +154,7 @@ class Batcher:
         """Canvases that wait."""
         return len(self._waiting)
 
-    def submit(self, canvas: NDArray[np.uint8], deadline: float) -> Future[tuple[RawOutputs, float, float]]:
+    def submit(self, canvas: NDArray[np.uint8], deadline: float) -> Future[tuple[RawOutputs, float, float, int]]:
         """Put a canvas into the queue.
 
         Args:
@@ -162,8 +162,8 @@ class Batcher:
             deadline: On `time.monotonic`; one that is not started by then fails with `BusyError`.
 
         Returns:
-            Its raw outputs (a batch of one), the seconds it waited, and the seconds its batch took. Cancelling the
-            future takes it out of the queue if it has not been started.
+            Its raw outputs (a batch of one), the seconds it waited, the seconds its whole batch took, and the images
+            in that batch. Cancelling the future takes it out of the queue if it has not been started.
 
         Raises:
             BusyError: If the service is closing.
@@ -238,7 +238,7 @@ class Batcher:
         seconds = time.monotonic() - start
         self._observe(len(batch))
         for item, piece in zip(batch, pieces, strict=True):
-            item.future.set_result((piece, start - item.entered, seconds))
+            item.future.set_result((piece, start - item.entered, seconds, len(batch)))
 
 
 def split(raw: RawOutputs, count: int) -> list[RawOutputs]:

@@ -35,6 +35,7 @@ def serve(
     max_pixels: int = 7680 * 4320,
     memory: int = 2**30,
     max_connections: int = 512,
+    upload_timeout: float = 20.0,
     drain: float = 1.0,
     log_level: str = "info",
 ) -> None:
@@ -62,6 +63,7 @@ def serve(
         max_pixels: Pixels of one image.
         memory: Bytes that bodies, images in work and answers of all requests may take together; beyond, 503.
         max_connections: Open connections; one more gets 503.
+        upload_timeout: Seconds in which the body of a request must arrive; then it gets 408.
         drain: Seconds that the service still accepts after it was told to stop.
         log_level: What is logged: debug, info, warning or error.
 
@@ -92,6 +94,7 @@ def serve(
         max_pixels=max_pixels,
         memory=memory,
         max_connections=max_connections,
+        upload_timeout=upload_timeout,
         max_images=min(Settings.max_images, queue),
         drain=drain,
         token=_read_token(token_file),

@@ -30,6 +30,7 @@ from trilitenet.apps.server.rest import read_request, until_vanished
 from trilitenet.apps.server.service import Encoded, Service, in_time
 from trilitenet.apps.server.settings import BYTES_PER_PIXEL, Settings
 from trilitenet.config import ModelCard
+from trilitenet.errors import did_you_mean
 from trilitenet.structures import Perception
 
 __all__ = ["protocol_router"]
@@ -54,17 +55,32 @@ _NO_PIXELS: Final = "data must hold whole numbers from 0 to 255"
 _SLICE: Final = 2**16
 """Numbers that are checked, or letters of base64 decoded, at once: between two slices other threads get their turn."""
 
+_PARAMETERS: Final = ("confidence", "binary_data_output")
+"""Parameters of a request that mean something here."""
+
+_PASSED_OVER: Final = ("sequence_id", "sequence_start", "sequence_end", "priority", "timeout")
+"""Those that the protocol's clients send by themselves."""
+
 _MAX_MASK_PIXELS: Final = 4_000_000
 """Pixels of all images of a request whose masks are wanted as JSON."""
 
 
 class _Query(NamedTuple):
-    """A parsed inference request: images, and for each output whether it is wanted in binary form."""
+    """A parsed inference request.
+
+    Attributes:
+        identifier: What the client calls the request.
+        images: Encoded or as pixels.
+        size: Height and width of each in pixels.
+        outputs: For each output whether it is wanted in binary form.
+        confidence: Replaces the model's threshold for boxes.
+    """
 
     identifier: str | None
     images: list[Encoded | NDArray[np.uint8]]
     size: tuple[int, int]
     outputs: dict[str, bool]
+    confidence: float | None
 
 
 def protocol_router(service: Service) -> APIRouter:
@@ -76,7 +92,7 @@ def protocol_router(service: Service) -> APIRouter:
     async def server_metadata() -> Response:
         return JSONResponse({"name": "trilitenet", "version": __version__, "extensions": ["binary_tensor_data"]})
 
-    @router.get("/v2/health/live", **openapi.ANY)
+    @router.get("/v2/health/live", **openapi.READY)
     async def live() -> Response:
         return JSONResponse({"live": service.alive}, status_code=200 if service.alive else 503)
 
@@ -120,7 +136,9 @@ def protocol_router(service: Service) -> APIRouter:
             count = len(query.images)
             reservation.take(sum(map(_cost, query.images)))
             with service.admit(count - 1) if count > 1 else nullcontext():
-                perceptions = await service.see_all(query.images, deadline, lambda outcome: outcome.perception)
+                perceptions = await service.see_all(
+                    query.images, deadline, lambda outcome: outcome.perception, query.confidence
+                )
                 return await service.in_pool(_answer, service.name, query, perceptions)
 
         with service.admit(1) as deadline:  # how many images there are is known only when the request is parsed
@@ -216,6 +234,7 @@ def _parse(body: bytes, split: int, names: Sequence[str], settings: Settings) ->
     shape = tensor.get("shape")
     if not isinstance(shape, list) or not all(type(side) is int and 0 < side <= 2**31 for side in shape):
         raise _bad("shape must be a list of positive numbers")
+    confidence = _confidence(mapping)
     outputs = _wanted(mapping, names)
     if shape and shape[0] > settings.max_images:
         raise ProblemError(413, "too_many_images", f"at most {settings.max_images} images are taken at once")
@@ -233,7 +252,28 @@ def _parse(body: bytes, split: int, names: Sequence[str], settings: Settings) ->
             "too_many_values",
             f"masks of more than {_MAX_MASK_PIXELS:,} pixels are not sent as JSON: ask for binary_data, or for boxes",
         )
-    return _Query(identifier, images, size, outputs)
+    return _Query(identifier, images, size, outputs, confidence)
+
+
+def _confidence(mapping: dict[str, Any]) -> float | None:
+    """Return the parameter ``confidence`` of a request.
+
+    Raises:
+        ProblemError: 400 if it is no number from 0 to 1, or there is a parameter that means nothing here.
+    """
+    parameters = mapping.get("parameters") or {}
+    if not isinstance(parameters, dict):
+        raise _bad("the parameters of a request must be an object")
+    for name in parameters:
+        if name not in (*_PARAMETERS, *_PASSED_OVER):
+            name = name[:40]
+            raise _bad(f"unknown parameter {name!r}{did_you_mean(name, _PARAMETERS)}")
+    confidence = parameters.get("confidence")
+    if confidence is None:
+        return None
+    if type(confidence) not in {int, float} or not 0 <= confidence <= 1:
+        raise _bad(f"confidence must be a number from 0 to 1, got {confidence!r:.40}")
+    return float(confidence)
 
 
 def _wanted(mapping: dict[str, Any], names: Sequence[str]) -> dict[str, bool]:

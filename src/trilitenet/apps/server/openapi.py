@@ -70,7 +70,8 @@ class PerceptionForm(_Strict):
 
 class _Seen(_Strict):
     status: Literal[200]
-    milliseconds: dict[str, float] = Field(description="Time in each stage.")
+    milliseconds: dict[str, float] = Field(description="Time in each stage; in the network, that of the whole batch.")
+    batch: int = Field(ge=1, description="Images that went through the network at once, of this request and of others.")
     perception: PerceptionForm
 
 
@@ -135,6 +136,7 @@ _PERCEPTION: Final = {
 _SEEN: Final = {
     "status": 200,
     "milliseconds": {"decode": 6.1, "preprocess": 0.7, "queue": 0.1, "network": 10.4, "postprocess": 1.2},
+    "batch": 1,
     "perception": _PERCEPTION,
 }
 _ABOUT: Final = {"request_id": "6f1c2f4b7d5e4a6b9f0e6d1c2b3a4958", "model": "small"}
@@ -165,8 +167,11 @@ _REFUSALS[503]["headers"] = _RETRY
 _FILE: Final = {"type": "string", "format": "binary"}
 
 
-def _form(schema: dict[str, Any]) -> dict[str, Any]:
-    return {"multipart/form-data": {"schema": {"type": "object", "properties": schema}}}
+def _body(schema: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "multipart/form-data": {"schema": {"type": "object", "properties": schema}},
+        **{kind: {"schema": _FILE} for kind in ("image/jpeg", "image/png", "image/webp")},
+    }
 
 
 PREDICT: Final[dict[str, Any]] = {
@@ -187,10 +192,7 @@ PREDICT: Final[dict[str, Any]] = {
         "requestBody": {
             "required": True,
             "description": "The image itself, or a form with the field image.",
-            "content": {
-                **_form({"image": _FILE}),
-                **{kind: {"schema": _FILE} for kind in ("image/jpeg", "image/png", "image/webp")},
-            },
+            "content": _body({"image": _FILE}),
         }
     },
 }
@@ -216,8 +218,8 @@ PREDICT_BATCH: Final[dict[str, Any]] = {
     "openapi_extra": {
         "requestBody": {
             "required": True,
-            "description": "A form with the field images, several times.",
-            "content": _form({"images": {"type": "array", "items": _FILE}}),
+            "description": "A form with the field images, several times, or one image itself.",
+            "content": _body({"images": {"type": "array", "items": _FILE}}),
         }
     },
 }
@@ -226,7 +228,8 @@ MODELS: Final[dict[str, Any]] = {
     "responses": {
         200: {
             "description": "The model card: variant, classes, thresholds, training data, figures, licence; the "
-            "confidence above which boxes are kept, the least that may be asked for, and images of one batch request.",
+            "confidence above which boxes are kept, the least that may be asked for; the most images of a batch "
+            "request, pixels of an image and of a side, bytes of a request, and seconds until they must be there.",
             "content": {
                 "application/json": {
                     "example": {
@@ -239,6 +242,10 @@ MODELS: Final[dict[str, Any]] = {
                                 "confidence": 0.25,
                                 "least_confidence": 0.0,
                                 "max_images": 16,
+                                "max_pixels": 33177600,
+                                "max_side": 16384,
+                                "max_body": 20971520,
+                                "upload_timeout": 20.0,
                                 "card": {"variant": "small", "class_names": ["vehicle"]},
                             }
                         ],
@@ -302,13 +309,16 @@ INFER: Final[dict[str, Any]] = {
     "openapi_extra": {
         "requestBody": {
             "required": True,
+            "description": "The parameter confidence, from 0 to 1, keeps boxes above it; the model's own threshold if "
+            "left out.",
             "content": {
                 "application/json": {
                     "schema": {"type": "object"},
                     "example": {
+                        "parameters": {"confidence": 0.3},
                         "inputs": [
                             {"name": "image", "datatype": "UINT8", "shape": [1, 1, 2, 3], "data": [0, 0, 0, 9, 9, 9]}
-                        ]
+                        ],
                     },
                 },
                 "application/octet-stream": {"schema": _FILE},

@@ -7,6 +7,7 @@ import dataclasses
 import io
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Coroutine
 from typing import Annotated, Any, Final, Literal, TypeVar
 
@@ -38,6 +39,9 @@ Confidence = Annotated[
 
 _NOT_ACCEPTABLE: Final = re.compile(r"q=0(\.0{0,3})?")
 """Weight of what a client does not want."""
+
+_TOLD_LIMITS: Final = ("max_images", "max_pixels", "max_side", "max_body", "upload_timeout")
+"""Settings that a client can heed before it sends anything."""
 
 _PALETTE: Final = (0, 0, 0, *DRIVABLE_COLOUR, *LANE_COLOUR, 213, 94, 0)
 """Colours of the values 0 to 3 of a mask image, so that it can be looked at."""
@@ -99,7 +103,7 @@ def rest_router(service: Service) -> APIRouter:
             "ready": service.ready,
             "confidence": service.predictor.thresholds.confidence,
             "least_confidence": service.predictor.least_confidence,
-            "max_images": service.settings.max_images,
+            **{name: getattr(service.settings, name) for name in _TOLD_LIMITS},
             "card": card,
         }
         return JSONResponse({"version": __version__, "models": [model]})
@@ -123,13 +127,18 @@ def rest_router(service: Service) -> APIRouter:
 
 
 def _only(*known: str) -> Any:
-    """Return a dependency that refuses other parameters: a misspelt one would be passed over without a word."""
+    """Return a dependency that refuses other parameters, and one given twice.
+
+    A misspelt one, or all but the last, would be passed over without a word.
+    """
 
     async def check(request: Request) -> None:
-        for name in request.query_params:
+        for name, count in Counter(name for name, _ in request.query_params.multi_items()).items():
             if name not in known:
                 name = name[:40]
                 raise ProblemError(422, "bad_parameter", f"unknown parameter {name!r}{did_you_mean(name, known)}")
+            if count > 1:
+                raise ProblemError(422, "bad_parameter", f"{name} is given {count} times: give it once")
 
     return Depends(check)
 
@@ -244,7 +253,12 @@ def _about(request: Request, service: Service) -> dict[str, Any]:
 
 
 def _to_mapping(outcome: Outcome) -> dict[str, Any]:
-    return {"status": 200, "milliseconds": outcome.milliseconds, "perception": outcome.perception.to_dict()}
+    return {
+        "status": 200,
+        "milliseconds": outcome.milliseconds,
+        "batch": outcome.batch,
+        "perception": outcome.perception.to_dict(),
+    }
 
 
 def _to_json(mapping: dict[str, Any]) -> bytes:

@@ -54,12 +54,14 @@ class Outcome:
     Attributes:
         perception: In pixels of the image.
         image: (height, width, 3) uint8 RGB, if it was to be kept.
-        milliseconds: By stage.
+        milliseconds: By stage; that of the network is the whole batch's.
+        batch: Images that went through the network at once.
     """
 
     perception: Perception
     image: NDArray[np.uint8] | None
     milliseconds: dict[str, float]
+    batch: int
 
 
 class Service:
@@ -204,9 +206,10 @@ class Service:
         images: Sequence[Encoded | NDArray[np.uint8]],
         deadline: float,
         finish: Callable[[Outcome], _T],
+        confidence: float | None = None,
     ) -> list[_T]:
-        """Take several admitted images through all stages; the first failure ends them all."""
-        return await together(self.see(image, deadline, finish) for image in images)
+        """Take several admitted images through all stages, as `see`; the first failure ends them all."""
+        return await together(self.see(image, deadline, finish, confidence) for image in images)
 
     async def _stages(
         self,
@@ -218,10 +221,10 @@ class Service:
     ) -> _T:
         loop = asyncio.get_running_loop()
         pixels, canvas, letterbox, milliseconds = await self.in_pool(self._prepare, image, keep_image)
-        raw, waited, ran = await asyncio.wrap_future(self._batcher.submit(canvas, deadline))
+        raw, waited, ran, batch = await asyncio.wrap_future(self._batcher.submit(canvas, deadline))
         self._note(milliseconds, "queue", waited)
         self._note(milliseconds, "network", ran)
-        call = functools.partial(self._answer, raw, letterbox, pixels, milliseconds, predictor, finish)
+        call = functools.partial(self._answer, raw, letterbox, pixels, milliseconds, batch, predictor, finish)
         return await loop.run_in_executor(self._outcome, call)
 
     def _prepare(
@@ -245,6 +248,7 @@ class Service:
         letterbox: Letterbox,
         pixels: NDArray[np.uint8] | None,
         milliseconds: dict[str, float],
+        batch: int,
         predictor: Predictor,
         finish: Callable[[Outcome], _T],
     ) -> _T:
@@ -252,7 +256,7 @@ class Service:
         (perception,) = predictor.postprocess(raw, [letterbox])
         self._note(milliseconds, "postprocess", time.monotonic() - start)
         start = time.monotonic()
-        answer = finish(Outcome(perception, pixels, milliseconds))
+        answer = finish(Outcome(perception, pixels, milliseconds, batch))
         self.metrics.stage("encode", time.monotonic() - start)
         return answer
 

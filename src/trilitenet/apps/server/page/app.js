@@ -1,10 +1,13 @@
 // The page: wires the controls to what is seen. No library, no build step, no request but to this service.
 
-import { ServiceError, capital, getModel, pause, plural, predict, predictBatch, setToken } from "./client.js";
+import { ServiceError, capital, getModel, isTooMuch, pause, plural, predict, predictBatch, setToken } from "./client.js";
 import { drawFrame, prepare, shownBoxes } from "./draw.js";
 import { openCamera, openClip, openPhoto } from "./sources.js";
 
 const LAYERS = ["detection", "drivable", "lane"];
+const CLIP_TYPES = ["video/webm", "video/mp4"]; // what a clip is saved as, by what the browser records
+const LEAST_PHOTO = 2 ** 16; // bytes of a photo that is not made smaller again
+const FORM = 256; // bytes of a form around each picture
 const STAGES = ["decode", "preprocess", "queue", "network", "postprocess"];
 
 const element = (id) => document.getElementById(id);
@@ -14,6 +17,7 @@ options.confidence = 0.25;
 
 let floor = 0.05; // boxes below are not even asked for
 let chunkSize = 8; // frames of a clip in one request
+let limits = null; // what the service takes, of /v1/models
 let frames = []; // { blob, result, picture?, time? }: pictures of a clip are decoded again when they are shown
 let current = null; // the prepared frame on the canvas
 let position = 0;
@@ -89,17 +93,31 @@ async function showFrame(index, announce = true) {
   element("save-overlay").disabled = element("save-json").disabled = false;
   element("seek").value = index;
   element("seek-text").textContent = `${index + 1} / ${frames.length}`;
-  const { milliseconds, roundTrip } = frame.result;
-  element("timing-total").textContent = `: ${roundTrip.toFixed(0)} ms`;
-  const known = STAGES.filter((stage) => stage in milliseconds).map((stage) => [stage, milliseconds[stage].toFixed(1)]);
-  fillTable(element("timing"), [...known, [frames.length > 1 ? "round trip, a frame's share" : "round trip", roundTrip.toFixed(1)]]);
+  showTiming(frame.result);
   redraw(announce);
+}
+
+/** Show where the time went; what several pictures took at once is no picture's own. */
+function showTiming({ milliseconds, batch, roundTrip, together }) {
+  const share = roundTrip / together;
+  const name = (stage) => (stage === "network" && batch > 1 ? `network, for ${batch} pictures at once` : stage);
+  const rows = STAGES.filter((stage) => stage in milliseconds).map((stage) => [name(stage), milliseconds[stage]]);
+  rows.push([together > 1 ? `round trip of ${together} frames` : "round trip", roundTrip]);
+  if (together > 1) rows.push(["a frame's share", share]);
+  element("timing-total").textContent = `: ${share.toFixed(0)} ms`;
+  fillTable(element("timing"), rows.map(([label, value]) => [label, value.toFixed(1)]));
+}
+
+/** The form in which this browser records the canvas, or undefined. */
+function clipType() {
+  if (!window.MediaRecorder || !view.captureStream) return undefined;
+  return CLIP_TYPES.find((type) => MediaRecorder.isTypeSupported(type));
 }
 
 function showPlayer() {
   const several = frames.length > 1;
   element("player").hidden = !several;
-  element("save-clip").hidden = !several || !window.MediaRecorder || !view.captureStream;
+  element("save-clip").hidden = !several || !clipType();
   element("seek").max = Math.max(0, frames.length - 1);
 }
 
@@ -124,6 +142,8 @@ async function meet() {
     element("model").textContent = `model ${model.name} on ${model.backend}`;
     floor = Math.max(Math.min(floor, model.confidence), model.least_confidence);
     chunkSize = Math.min(chunkSize, model.max_images);
+    const { max_pixels, max_side, max_body } = model;
+    limits = { max_pixels, max_side, max_body: max_body - FORM };
     setSlider(element("confidence"), model.confidence);
     readControls();
   } catch (error) {
@@ -200,12 +220,25 @@ function openFile(file) {
 async function seePhoto(file, name, signal) {
   element("summary").textContent = "Looking …";
   document.body.setAttribute("aria-busy", "true");
-  const { blob, picture } = await openPhoto(file);
-  const result = await predict(blob, floor, signal);
+  const { blob, picture, result } = await predictPhoto(file, signal);
   frames = [{ blob, result, picture: picture ?? (await createImageBitmap(blob)) }];
   fileName = name;
   showPlayer();
   await showFrame(0);
+}
+
+/** See a photo; one that is refused as too much is sent smaller. */
+async function predictPhoto(file, signal) {
+  for (let most = limits.max_body; ; ) {
+    const { blob, picture } = await openPhoto(file, { ...limits, max_body: most });
+    try {
+      return { blob, picture, result: await predict(blob, floor, signal) };
+    } catch (error) {
+      if (!isTooMuch(error) || !picture || blob.size <= LEAST_PHOTO) throw error;
+      most = blob.size / 2;
+      element("summary").textContent = "Too much at once: sending a smaller picture …";
+    }
+  }
 }
 
 async function seeClip(file, name, signal) {
@@ -215,8 +248,9 @@ async function seeClip(file, name, signal) {
   element("progress-row").hidden = false;
   bar.value = 0;
   element("progress-text").textContent = "Opening the clip …";
-  let chunk = [];
-  for await (const frame of openClip(file, wanted, signal)) {
+  let most = chunkSize;
+  let waiting = [];
+  for await (const frame of openClip(file, wanted, limits, signal)) {
     if (frame.index === 0 && frame.seconds * wanted >= frame.count + 1) {
       const reach = (frame.count / wanted).toFixed(0);
       showError(
@@ -224,27 +258,46 @@ async function seeClip(file, name, signal) {
           "Choose fewer frames per second or a shorter clip.",
       );
     }
-    chunk.push(frame);
-    if (chunk.length < chunkSize && frame.index < frame.count - 1) continue;
-    const results = await predictBatch(chunk.map((one) => one.blob), floor, signal);
-    for (const [index, one] of chunk.entries()) {
-      one.picture.close();
-      seen.push({ blob: one.blob, time: one.time, result: results[index] });
+    frame.picture.close();
+    waiting.push(frame);
+    const last = frame.index === frame.count - 1;
+    while (waiting.length >= (last ? 1 : most)) {
+      const chunk = waiting.slice(0, countFitting(waiting, most));
+      let results;
+      try {
+        results = await predictBatch(chunk.map((one) => one.blob), floor, signal);
+      } catch (error) {
+        if (!isTooMuch(error) || chunk.length === 1) throw error;
+        most = Math.ceil(chunk.length / 2);
+        element("progress-text").textContent = `Too much at once: sending ${most} frames instead of ${chunk.length} …`;
+        continue;
+      }
+      waiting = waiting.slice(chunk.length);
+      seen.push(...chunk.map(({ blob, time }, index) => ({ blob, time, result: results[index] })));
+      frames = seen; // only now: until its first frames are seen, what was shown before stays whole
+      fileName = name;
+      rate = wanted;
+      bar.value = frames.length / frame.count;
+      element("progress-text").textContent = `Frame ${frames.length} of ${frame.count}`;
+      showPlayer();
+      if (!player) await showFrame(frames.length - 1, false);
     }
-    chunk = [];
-    frames = seen; // only now: until its first frames are seen, what was shown before stays whole
-    fileName = name;
-    rate = wanted;
-    bar.value = frames.length / frame.count;
-    element("progress-text").textContent = `Frame ${frames.length} of ${frame.count}`;
-    showPlayer();
-    if (!player) await showFrame(frames.length - 1, false);
   }
   if (!player) await showFrame(0);
 }
 
+/** How many of the first frames go into one request, at least one and at most `most`. */
+function countFitting(waiting, most) {
+  let count = 0;
+  for (let room = limits.max_body + FORM; count < Math.min(most, waiting.length); count += 1) {
+    room -= waiting[count].blob.size + FORM;
+    if (room < 0) break;
+  }
+  return Math.max(1, count);
+}
+
 async function seeCamera(signal) {
-  for await (const { blob, picture } of openCamera(signal)) {
+  for await (const { blob, picture } of openCamera(limits, signal)) {
     const result = await predict(blob, floor, signal);
     frames[0]?.picture?.close?.();
     frames = [{ blob, result, picture }];
@@ -297,7 +350,7 @@ async function saveClip() {
   const mine = (player = {}); // another job, whose frames are others, ends it as it ends the playing
   element("play").textContent = "Play";
   const button = element("save-clip");
-  const recorder = new MediaRecorder(view.captureStream());
+  const recorder = new MediaRecorder(view.captureStream(), { mimeType: clipType() });
   const controls = [button, element("play"), element("seek")]; // which would change what is recorded
   for (const control of controls) control.disabled = true;
   const pieces = [];
@@ -314,7 +367,8 @@ async function saveClip() {
   }
   recorder.stop();
   await stopped;
-  if (player === mine) save(new Blob(pieces, { type: "video/webm" }), ".webm");
+  const [type] = recorder.mimeType.split(";"); // without the codecs
+  if (player === mine) save(new Blob(pieces, { type }), `.${type.split("/")[1]}`);
   else showError("The clip was not saved, as something else was opened.");
   player = null;
   button.textContent = "Save clip";

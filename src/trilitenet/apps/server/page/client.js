@@ -78,7 +78,7 @@ export async function getModel() {
   return (await ask("v1/models")).models[0];
 }
 
-/** See one picture (a Blob). All boxes come, also unsure ones: the slider chooses. */
+/** See one picture (a Blob). All boxes come, also unsure ones: the slider chooses. `roundTrip` is that of the request. */
 export async function predict(blob, floor, signal) {
   const started = performance.now();
   const result = await patiently(`v1/predict?confidence=${floor}`, {
@@ -87,7 +87,12 @@ export async function predict(blob, floor, signal) {
     headers: { "content-type": blob.type || "application/octet-stream" },
     signal,
   });
-  return { ...result, roundTrip: performance.now() - started };
+  return { ...result, roundTrip: performance.now() - started, together: 1 };
+}
+
+/** Whether a refusal says that less must be sent at once: it was too large, or too slow on its way. */
+export function isTooMuch(error) {
+  return error instanceof ServiceError && [408, 413].includes(error.status);
 }
 
 /** See several pictures in one request; those for which there was no time are asked for again, and they alone. */
@@ -106,9 +111,9 @@ export async function predictBatch(blobs, floor, signal) {
     left = busy;
     if (left.length) await pause(1000, signal);
   }
-  const roundTrip = (performance.now() - started) / blobs.length;
+  const roundTrip = performance.now() - started;
   return results.map((result) => {
     if (result.status !== 200) throw new ServiceError(result.status, sentence(result.error.message));
-    return { ...result, roundTrip };
+    return { ...result, roundTrip, together: blobs.length };
   });
 }
