@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import pkgutil
 import re
 import shlex
 import shutil
@@ -117,6 +118,25 @@ def test_the_map_is_complete() -> None:
 def test_every_command_has_a_place_in_the_documentation() -> None:
     text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
     assert [command.words for command in COMMANDS if f"trilitenet {command.words}" not in text] == []
+
+
+def test_every_function_of_a_command_is_in_the_reference() -> None:
+    shown = set(re.findall(r"^::: (\S+)$", (ROOT / "docs" / "reference.md").read_text(encoding="utf-8"), re.MULTILINE))
+    functions = {f"trilitenet.{command.package}.{command.module}.{command.function}" for command in COMMANDS}
+    network = {f"trilitenet.models.trilitenet.{name}" for name in ("TriLiteNet", "NetworkOutputs", "normalise_images")}
+    assert (functions | network) - shown == set()
+
+
+def test_what_the_reference_shows_exists() -> None:
+    for name in re.findall(r"^::: (\S+)$", (ROOT / "docs" / "reference.md").read_text(encoding="utf-8"), re.MULTILINE):
+        pkgutil.resolve_name(name)
+
+
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", ".pre-commit-config.yaml"])
+def test_what_no_extra_installs_is_told_how_to_install(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    assert "`pre-commit install`" in text
+    assert "`pip install pre-commit`" in text
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -85,6 +85,16 @@ def test_boxes_of_nothing_are_refused() -> None:
         Boxes(None, np.ones(1), np.zeros(1, np.int64))  # type: ignore[arg-type]
 
 
+def test_a_perception_is_shown_on_one_line() -> None:
+    drivable, lane = np.zeros((4, 25), bool), np.zeros((4, 25), bool)
+    drivable[:2, :15], lane[0, :3] = True, True
+    assert repr(Perception((4, 25), ("car", "bus"), boxes(0, 1), drivable, lane)) == (
+        "Perception(25x4, 2 boxes, drivable 30%, lane 3%)"
+    )
+    assert repr(Perception((4, 25), boxes=boxes(0))) == "Perception(25x4, 1 box)"
+    assert repr(Perception((0, 0), lane=np.zeros((0, 0), bool))) == "Perception(0x0, lane 0%)"
+
+
 @pytest.mark.parametrize("size", ["ab", (1, 2, 3), None, (-1, 2), (1.0, 2.0)])
 def test_a_size_is_two_whole_numbers(size: Any) -> None:
     with pytest.raises(ShapeError, match="size must be"):

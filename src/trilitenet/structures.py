@@ -152,7 +152,7 @@ class Perception:
     boxes: Boxes | None = None
     drivable: NDArray[np.bool_] | None = None
     lane: NDArray[np.bool_] | None = None
-    image: NDArray[np.uint8] | None = dataclasses.field(default=None, repr=False)
+    image: NDArray[np.uint8] | None = None
     source: str | None = None
     frame: int | None = None
     timestamp: float | None = None
@@ -179,6 +179,16 @@ class Perception:
             for class_id in (int(boxes.class_id.min()), int(boxes.class_id.max())):
                 if not 0 <= class_id < len(self.class_names):
                     raise ShapeError(f"class id {class_id} has no name among {self.class_names}")
+
+    def __repr__(self) -> str:
+        height, width = self.size
+        parts = [f"{width}x{height}"]
+        if self.boxes is not None:
+            parts.append("1 box" if len(self.boxes) == 1 else f"{len(self.boxes)} boxes")
+        for name, mask in (("drivable", self.drivable), ("lane", self.lane)):
+            if mask is not None:
+                parts.append(f"{name} {np.count_nonzero(mask) / max(mask.size, 1):.0%}")
+        return f"Perception({', '.join(parts)})"
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``json.dumps`` takes: the documented, versioned JSON form (masks as COCO run-length)."""

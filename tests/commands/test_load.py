@@ -37,6 +37,12 @@ def test_load_gives_a_predictor(weights: Path) -> None:
     assert perception.to_dict()["size"] == {"height": 90, "width": 160}
 
 
+def test_a_device_may_be_that_of_pytorch(weights: Path) -> None:
+    assert trilitenet.load(weights, device=torch.device("cpu")).backend.name == "torch cpu graph"
+    with pytest.raises(BackendError, match=r"'cuda:99'"):
+        trilitenet.load(weights, device=torch.device("cuda", 99))
+
+
 def test_thresholds_can_be_overridden_one_by_one(weights: Path) -> None:
     predictor = trilitenet.load(weights, device="cpu", confidence=0.7, lane=0.2)
     assert predictor.thresholds == Thresholds(confidence=0.7, lane=0.2)

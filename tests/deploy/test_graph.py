@@ -151,6 +151,7 @@ def test_thresholds_and_probabilities() -> None:
         outputs = network(normalise_images(images.permute(0, 3, 1, 2)))
     assert probability is not None
     assert strict is not None
+    assert outputs.lane is not None
     wanted = outputs.lane.softmax(1)[:, 1]
     assert (probability.float() - wanted * 255).abs().max() <= 0.51
     assert ((strict == 1) == ((wanted * 255).round() > int(0.51 * 255))).float().mean() > 0.9999

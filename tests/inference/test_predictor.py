@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from tests.fakes import ColourBackend, coloured_scene
@@ -83,6 +84,28 @@ def test_images_may_come_from_a_generator() -> None:
 def test_what_is_no_image_is_named_as_a_whole(image: Any) -> None:
     with pytest.raises(ShapeError, match=f"PIL image or an array, got {type(image).__name__}"):
         Predictor(ColourBackend())(image)
+
+
+def test_a_file_and_a_tensor_are_refused_with_the_cure() -> None:
+    predictor, tensor = Predictor(ColourBackend()), torch.zeros(3, 32, 32)
+    with pytest.raises(ShapeError, match=r"got BytesIO; pass its \.read\(\)$"):
+        predictor(io.BytesIO(b"x"))
+    images: tuple[Any, ...] = (tensor, [tensor], torch.zeros(()))
+    for image in images:
+        with pytest.raises(ShapeError, match=r"got Tensor; pass its \.numpy\(\) as \(height, width, 3\) uint8 RGB$"):
+            predictor(image)
+
+
+@pytest.mark.parametrize("url", ["https://host/x.jpg", Path("https://host/x.jpg"), "file:///tmp/x.jpg"])
+def test_a_url_is_told_from_a_path(url: str | Path) -> None:
+    for image in (url, [url]):
+        with pytest.raises(InputError, match=r"x\.jpg: is a URL; download it first, or use `trilitenet predict`$"):
+            Predictor(ColourBackend())(image)
+
+
+def test_it_is_shown_by_its_network_and_runtime() -> None:
+    backend = ColourBackend()
+    assert repr(Predictor(backend)) == f"Predictor({backend.card.variant} on {backend.name})"
 
 
 def test_images_in_memory_may_come_one_by_one_each_with_its_source() -> None:

@@ -36,6 +36,7 @@ def test_outputs_are_the_networks(backend: TorchBackend, rng: np.random.Generato
     assert raw.detection is not None
     np.testing.assert_allclose(raw.detection, expected, rtol=1e-4, atol=1e-4)
     for mask, logits in ((raw.drivable, outputs.drivable), (raw.lane, outputs.lane)):
+        assert logits is not None
         probability = logits.softmax(1)[:, 1].numpy() * 255
         assert mask is not None
         assert mask.shape == (2, 64, 96)

@@ -182,6 +182,8 @@ def test_weights_come_back_where_the_function_is_named(
     image = torch.rand(1, 3, 64, 96)
     with torch.no_grad():
         for found, wanted in zip(loaded(image)[1:], network.eval()(image)[1:], strict=True):
+            assert isinstance(found, torch.Tensor)
+            assert isinstance(wanted, torch.Tensor)
             assert torch.equal(found, wanted)
     with pytest.raises(WeightsError, match=rf"is of a network that {name_of(function)} builds; .*--network"):
         load_network(path)

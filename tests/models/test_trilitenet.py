@@ -62,6 +62,7 @@ def test_outputs_agree_with_the_published_network(golden: dict[str, NDArray[Any]
         outputs = network(torch.from_numpy(image))
         decoded = network.decode(outputs)
     for name, tensor in (("decoded", decoded), ("da", outputs.drivable), ("ll", outputs.lane)):
+        assert tensor is not None
         assert tuple(tensor.shape) == tuple(golden[f"{name}_shape"])
         expected = golden[name]
         got = tensor.flatten().numpy()[golden[f"{name}_idx"]]
@@ -97,6 +98,7 @@ def test_every_subset_of_tasks_and_any_class_count(tasks: tuple[str, ...], class
 def test_any_multiple_of_32_is_a_legal_size(size: tuple[int, int]) -> None:
     with torch.no_grad():
         outputs = build_network("tiny").eval()(torch.zeros(1, 3, *size))
+    assert outputs.drivable is not None
     assert outputs.drivable.shape == (1, 2, *size)
 
 
@@ -115,6 +117,35 @@ def test_any_multiple_of_32_is_a_legal_size(size: tuple[int, int]) -> None:
 def test_any_other_shape_is_a_clear_error(shape: tuple[int, ...]) -> None:
     with pytest.raises(ShapeError, match="multiples of 32"):
         build_network("tiny")(torch.zeros(shape))
+
+
+@pytest.mark.parametrize(
+    ("image", "told"),
+    [
+        (torch.zeros(1, 3, 64, 64, dtype=torch.uint8), r"as floats, got uint8; use trilitenet\..*normalise_images$"),
+        (np.zeros((1, 3, 64, 64), np.float32), "takes a tensor of .*, got a ndarray"),
+        ([torch.zeros(3, 64, 64)], "takes a tensor of .*, got a list"),
+        (None, "takes a tensor of .*, got a NoneType"),
+    ],
+)
+def test_pixels_and_what_is_no_tensor_are_refused_with_the_cure(image: Any, told: str) -> None:
+    with pytest.raises(ShapeError, match=told):
+        build_network("tiny").eval()(image)
+
+
+def test_only_what_the_network_returned_is_decoded() -> None:
+    network = build_network("tiny").eval()
+    with torch.no_grad():
+        outputs = network(torch.zeros(1, 3, 64, 64))
+    for other in (outputs.detection, tuple(outputs), None):
+        with pytest.raises(ShapeError, match=r"^decode takes what the network returned \(NetworkOutputs\), got a "):
+            network.decode(other)  # type: ignore[arg-type]
+
+
+def test_type_checkers_know_what_the_network_returns() -> None:  # mypy looks at the calls, as at a user's
+    network = build_network("tiny", tasks=("lane",)).eval()
+    outputs: int = network(torch.zeros(1, 3, 32, 32))  # type: ignore[assignment]
+    assert isinstance(outputs, NetworkOutputs)
 
 
 def test_bad_arguments_name_what_is_valid() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gzip
 import json
 import os
 import pickle
@@ -14,6 +15,7 @@ from typing import Any
 import pytest
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -64,7 +66,7 @@ def test_round_trip(tmp_path: Path, classes: int, tasks: tuple[str, ...], blocks
     with torch.no_grad():
         for got, expected in zip(loaded(image), network(image), strict=True):
             assert (got is None) == (expected is None)
-            if isinstance(got, torch.Tensor):
+            if isinstance(got, torch.Tensor) and isinstance(expected, torch.Tensor):
                 assert torch.equal(got, expected)
 
 
@@ -135,6 +137,8 @@ def test_weights_of_other_layers_are_not_loaded_as_those_of_ours(tmp_path: Path)
 def test_files_that_are_not_weights(tmp_path: Path, saved: Path) -> None:
     (tmp_path / "empty.safetensors").touch()
     (tmp_path / "text.safetensors").write_text("not weights at all")
+    (tmp_path / "pointer.safetensors").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:12ab\n")
+    (tmp_path / "long.safetensors").write_bytes(b'<\0\0\0\0\0\0\0{"a":')  # the header's length is a "<"
     (tmp_path / "model.onnx").write_bytes(b"\x08\x08 exported")
     (tmp_path / "cut.safetensors").write_bytes(saved.read_bytes()[:20_000])
     torch.save({"a": torch.zeros(1)}, tmp_path / "pickle.pth")
@@ -145,6 +149,8 @@ def test_files_that_are_not_weights(tmp_path: Path, saved: Path) -> None:
     cases = {
         "empty.safetensors": "is empty",
         "text.safetensors": "not a safetensors file",
+        "pointer.safetensors": "is not a safetensors file: it is a Git LFS pointer; download the file itself",
+        "long.safetensors": r"or is truncated \(.*\); copy it again",
         "cut.safetensors": "truncated",
         "pickle.pth": "weights import",
         "model.onnx": r"is an exported file, not weights; trilitenet\.load\(.*model\.onnx'\)\.card",
@@ -251,8 +257,19 @@ def test_import_refuses_what_is_not_a_checkpoint(golden: dict[str, NDArray[Any]]
     (tmp_path / "cut.safetensors").write_bytes((tmp_path / "whole.safetensors").read_bytes()[:20_000])
     (tmp_path / "cut2.pth").write_bytes((tmp_path / "whole.safetensors").read_bytes()[:20_000])
     (tmp_path / "text.pth").write_text("hello")
+    (tmp_path / "page.pth").write_text("<!DOCTYPE html>\n<html><body>Not found</body></html>")
+    (tmp_path / "page.safetensors").write_text("\n<html></html>")
+    (tmp_path / "pointer.pth").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:12ab\nsize 9\n")
+    (tmp_path / "answer.pth").write_text('{"message":"Not Found"}')
+    (tmp_path / "answer2.pth").write_text("Not Found")
+    (tmp_path / "packed.pth").write_bytes(gzip.compress((tmp_path / "good.pth").read_bytes()[:1000]))
+    Image.new("RGB", (32, 32)).save(tmp_path / "picture.pth", "JPEG")
+    (tmp_path / "plain.pth").write_bytes(pickle.dumps({"a": 1}, protocol=4))
     (tmp_path / "empty.pth").touch()
-    (tmp_path / "code.pth").write_bytes(pickle.dumps({"a": _Code(tmp_path / "touched")}))
+    for protocol in range(6):
+        pickled = pickle.dumps({"a": _Code(tmp_path / "touched")}, protocol=protocol)
+        (tmp_path / f"code{protocol}.pth").write_bytes(pickled)
+    torch.save(state, tmp_path / "newer.pth", pickle_protocol=4)
     torch.save({"zip": _Code(tmp_path / "touched")}, tmp_path / "zipcode.pth")
     torch.save([1, 2], tmp_path / "list.pth")
     torch.save({"conv.weight": torch.zeros(1)}, tmp_path / "foreign.pth")
@@ -269,7 +286,16 @@ def test_import_refuses_what_is_not_a_checkpoint(golden: dict[str, NDArray[Any]]
         "cut2.pth": "is a safetensors file, but is damaged, or is truncated",
         "text.pth": "not a PyTorch checkpoint",
         "empty.pth": "is empty",
-        "code.pth": "holds code",
+        "page.pth": "is not a PyTorch checkpoint: it is a web page; download the file itself",
+        "page.safetensors": "ends in .safetensors, but is not such a file: it is a web page; download the file itself",
+        "pointer.pth": "is not a PyTorch checkpoint: it is a Git LFS pointer; download the file itself",
+        "answer.pth": "is not a PyTorch checkpoint: it is text; download the file itself",
+        "answer2.pth": "is not a PyTorch checkpoint, or is truncated",
+        "packed.pth": "is not a PyTorch checkpoint: it is compressed; unpack it",
+        "picture.pth": "is not a PyTorch checkpoint, or is truncated",
+        "plain.pth": "is not a PyTorch checkpoint, or is truncated",
+        **{f"code{protocol}.pth": "holds code" for protocol in range(6)},
+        "newer.pth": "or is of another pickle protocol than torch.save's own",
         "zipcode.pth": "holds code",
         "list.pth": "not a state dict",
         "foreign.pth": "not a published TriLiteNet checkpoint",

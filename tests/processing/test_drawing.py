@@ -65,6 +65,12 @@ def test_parts_can_be_hidden() -> None:
         draw(perception, hide=("boxs",))
 
 
+@pytest.mark.parametrize(("size", "labelled"), [((120, 160), False), ((160, 90), False), ((144, 256), True)])
+def test_labels_cover_no_objects_of_the_smallest_pictures(size: tuple[int, int], labelled: bool) -> None:
+    perception = scene(*size)
+    assert (draw(perception) != draw(perception, hide=("labels",))).any() == labelled
+
+
 def test_tracks_have_colours_of_their_own() -> None:
     boxes = Boxes(
         np.array([[20, 30, 60, 60]], np.float32), np.ones(1, np.float32), np.zeros(1, np.int64), np.array([3])

@@ -15,9 +15,11 @@ from trilitenet.inference.exported import is_int8_onnx
 from trilitenet.inference.predictor import Predictor
 
 if TYPE_CHECKING:
+    import torch
+
     from trilitenet.models.builders import Builder
 
-__all__ = ["BACKENDS", "check_parallel", "load", "open_backend", "own_builder"]
+__all__ = ["BACKENDS", "check_parallel", "is_exported", "load", "open_backend", "own_builder", "runtimes_of"]
 
 BACKENDS = ("auto", "torch", "onnxruntime", "openvino", "ncnn", "executorch", "tensorrt")
 """What ``backend`` may be."""
@@ -39,7 +41,7 @@ def load(
     model: str | os.PathLike[str] = "tiny",
     *,
     network: Builder | None = None,
-    device: str = "auto",
+    device: str | torch.device = "auto",
     backend: str = "auto",
     confidence: float | None = None,
     iou: float | None = None,
@@ -57,7 +59,7 @@ def load(
             it is in, .pte, .engine, .pt2).
         network: The function that builds the network of a file of weights, or its name, where that is not
             `build_network`; see `load_network`.
-        device: auto (the best there is), cpu, cuda, cuda:1, mps.
+        device: auto (the best there is), cpu, cuda, cuda:1, mps; or a ``torch.device``.
         backend: auto (the fastest present that runs the file), torch, onnxruntime, openvino, ncnn, executorch or
             tensorrt. A file of weights runs on PyTorch: auto is its deploy graph, on CUDA in fp16 under CUDA graphs,
             torch the plain network in fp32.
@@ -85,7 +87,7 @@ def load(
         raise ConfigError(f"unknown backend {backend!r}{did_you_mean(backend, BACKENDS)}")
     check_parallel(streams=streams, threads=threads)
     with needing_torch():
-        runtime = open_backend(model, device, backend, streams, threads, network)
+        runtime = open_backend(model, str(device), backend, streams, threads, network)
     try:
         if long_side is not None and runtime.canvas is not None and long_side != max(runtime.canvas):
             height, width = runtime.canvas
@@ -112,12 +114,29 @@ def own_builder(model: str | os.PathLike[str], network: str | None) -> str | Non
     Raises:
         WeightsError: If the file is broken.
     """
-    path = Path(os.fspath(model))
-    if network is None or path.suffix.lower() in _EXPORTED or path.is_dir():
+    if network is None or is_exported(model) or Path(model).is_dir():
         return None
     from trilitenet.models.weights import read_builder
 
     return network if read_builder(model) is not None else None
+
+
+def is_exported(model: str | os.PathLike[str]) -> bool:
+    """Return whether a model is an exported file, which holds its network; else it is weights, by file or name."""
+    return _suffix(model) in _EXPORTED
+
+
+def runtimes_of(model: str | os.PathLike[str]) -> tuple[str, ...]:
+    """Return the runtimes that run a model, by the kind of its file."""
+    return _RUNS.get(_suffix(model), ("torch",))
+
+
+def _suffix(model: str | os.PathLike[str]) -> str:
+    """Return the suffix of a model's file, in small letters; of a folder with an artefact of NCNN that of its graph."""
+    path = Path(os.fspath(model))
+    if str(model) not in VARIANTS and path.is_dir() and any(path.glob("*.param")):
+        return ".param"
+    return path.suffix.lower()
 
 
 def check_parallel(**counts: int | None) -> None:
@@ -140,12 +159,8 @@ def open_backend(
     network: Builder | None = None,
 ) -> Backend:
     """Open a file on the runtime asked for, or on the fastest one here that runs it."""
-    path = Path(os.fspath(model))
-    suffix, fastest = path.suffix.lower(), backend == "auto"
-    if str(model) not in VARIANTS and path.is_dir() and any(path.glob("*.param")):
-        suffix = ".param"
-    runs = _RUNS.get(suffix, ("torch",))
-    if network is not None and suffix in _EXPORTED:
+    fastest, runs = backend == "auto", runtimes_of(model)
+    if network is not None and is_exported(model):
         raise ConfigError(f"{model}: is an exported file, which holds its network; leave --network out")
     if backend == "auto":
         # OpenVINO was the faster of the two on every processor measured (docs/speed.md); it has no CUDA.
@@ -155,7 +170,7 @@ def open_backend(
         backend = (usable or runs)[0]
     elif backend not in runs:
         cure = f"; make a file for it with: trilitenet export {model} --format {_MADE.get(backend, backend)}"
-        raise ConfigError(f"{model} runs on {' or '.join(runs)}, not on {backend}{'' if suffix in _EXPORTED else cure}")
+        raise ConfigError(f"{model} runs on {' or '.join(runs)}, not on {backend}{'' if is_exported(model) else cure}")
     if backend == "openvino":
         from trilitenet.inference.openvino_backend import OpenVINOBackend
 
@@ -180,7 +195,7 @@ def open_backend(
         import torch
 
         torch.set_num_threads(threads)
-    if suffix == ".pt2":
+    if _suffix(model) == ".pt2":
         from trilitenet.inference.exported_torch_backend import ExportedTorchBackend
 
         return ExportedTorchBackend(model, device)

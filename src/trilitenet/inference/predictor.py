@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trilitenet.config import ArtefactInfo, ModelCard, Thresholds
-from trilitenet.errors import ConfigError, ShapeError
+from trilitenet.errors import ConfigError
 from trilitenet.inference.backend import Backend
-from trilitenet.processing.images import read_image
+from trilitenet.processing.images import no_image, read_image
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.processing.postprocess import to_perceptions
 from trilitenet.structures import Perception, RawOutputs
@@ -24,7 +24,7 @@ __all__ = ["ImageLike", "Predictor"]
 ImageLike: TypeAlias = str | Path | bytes | Image.Image | NDArray[Any]
 """A path, the bytes of an image file, a Pillow image, or a (height, width, 3) uint8 **RGB** array."""
 
-_LONGEST_SIDE: Final = 16384
+LONGEST_SIDE: Final = 16384
 """Pixels of the longer side at most: beyond, one image takes more memory than machines have."""
 
 
@@ -60,8 +60,8 @@ class Predictor:
         long_side = max(backend.card.input_size) if long_side is None else long_side
         if min(long_side, batch_size) < 1:
             raise ConfigError(f"long_side and batch_size must be at least 1, got {long_side} and {batch_size}")
-        if long_side > _LONGEST_SIDE:
-            raise ConfigError(f"long_side must be at most {_LONGEST_SIDE}, got {long_side}")
+        if long_side > LONGEST_SIDE:
+            raise ConfigError(f"long_side must be at most {LONGEST_SIDE}, got {long_side}")
         self.backend = backend
         self.thresholds = thresholds or backend.card.thresholds
         self._check_thresholds()
@@ -123,9 +123,10 @@ class Predictor:
         """
         if isinstance(image, (str, Path, bytes, Image.Image, np.ndarray)):
             return self.perceive([read_image(image)], [_name(image)])[0]
-        # Files and buffers give their lines and bytes one by one, which are no images.
-        if not isinstance(image, Iterable) or isinstance(image, (bytearray, memoryview)) or hasattr(image, "read"):
-            raise ShapeError(f"an image is a path, bytes, a PIL image or an array, got {type(image).__name__}")
+        # Files, buffers and tensors give their lines, bytes and rows one by one, which are no images.
+        whole = isinstance(image, (bytearray, memoryview)) or hasattr(image, "read") or hasattr(image, "numpy")
+        if whole or not isinstance(image, Iterable):
+            raise no_image(image)
         images = list(image)
         return self.perceive([read_image(one) for one in images], [_name(one) for one in images])
 
@@ -181,6 +182,9 @@ class Predictor:
     ) -> list[Perception]:
         """Turn the raw outputs of a batch into perceptions; see `to_perceptions`."""
         return to_perceptions(raw, letterboxes, self.thresholds, self.class_names, images, sources)
+
+    def __repr__(self) -> str:
+        return f"Predictor({self.card.variant} on {self.backend.name})"
 
     def close(self) -> None:
         """Free what the runtime holds."""

@@ -10,7 +10,7 @@ import functools
 import numbers
 import re
 from collections.abc import Iterable, Sequence
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import torch
 from numpy.typing import NDArray
@@ -109,15 +109,27 @@ class TriLiteNet(nn.Module):
             anchors=anchors,
         )
 
+    if TYPE_CHECKING:  # that of nn.Module returns Any
+
+        def __call__(self, image: Tensor) -> NetworkOutputs:
+            """Return the logits of every task; see `forward`."""
+
     def forward(self, image: Tensor) -> NetworkOutputs:
         """Return the logits of every task.
 
         Args:
-            image: (B, 3, H, W) RGB, normalised by `normalise_images`; H and W multiples of 32.
+            image: (B, 3, H, W) RGB, floats normalised by `normalise_images`; H and W multiples of 32.
 
         Raises:
-            ShapeError: If the shape is another.
+            ShapeError: If it is another shape, of whole numbers, or no tensor.
         """
+        if not isinstance(image, Tensor):
+            raise ShapeError(f"the network takes a tensor of (B, 3, H, W), got a {type(image).__name__}")
+        if not image.is_floating_point():
+            raise ShapeError(
+                f"the network takes normalised RGB as floats, got {str(image.dtype).removeprefix('torch.')}; "
+                "use trilitenet.models.trilitenet.normalise_images"
+            )
         fits = image.ndim == 4 and image.shape[1] == 3 and 0 not in image.shape
         if not fits or image.shape[2] % MAX_STRIDE or image.shape[3] % MAX_STRIDE:
             raise ShapeError(
@@ -145,13 +157,19 @@ class TriLiteNet(nn.Module):
     def decode(self, outputs: NetworkOutputs) -> Tensor:
         """Turn detection logits into boxes.
 
+        Args:
+            outputs: What the network returned.
+
         Returns:
             (B, N, 5 + classes): centre x, centre y, width, height in input pixels, objectness, class probabilities;
             levels 1/8, 1/16, 1/32 in turn, within a level by anchor, row, column.
 
         Raises:
             ConfigError: If the network was built without detection.
+            ShapeError: If it is something else.
         """
+        if not isinstance(outputs, NetworkOutputs):
+            raise ShapeError(f"decode takes what the network returned (NetworkOutputs), got a {type(outputs).__name__}")
         if outputs.detection is None:
             raise ConfigError("there is nothing to decode: this network was built without the detection task")
         levels = zip(outputs.detection, self.anchors, STRIDES, strict=True)

@@ -9,6 +9,7 @@ import dataclasses
 import hashlib
 import os
 import pickle
+import pickletools
 import re
 import struct
 import warnings
@@ -99,6 +100,17 @@ _UNREADABLE: Final = (
 
 _LONGEST_HEADER: Final = 100_000_000
 """Bytes of a safetensors file's header, which the format limits; the file begins with their number."""
+
+_NAMING: Final = frozenset({"GLOBAL", "STACK_GLOBAL", "INST"})
+"""Opcodes of a pickle that name a function or a class."""
+
+_IN_ITS_PLACE: Final = {
+    b"<": "a web page; download the file itself",
+    b"version https://git-lfs": "a Git LFS pointer; download the file itself",
+    b"{": "text; download the file itself",
+    b"\x1f\x8b": "compressed; unpack it",
+}
+"""What is often saved in a file's place, and the cure, by how it begins, in small letters."""
 
 _TRAINING_STATE: Final = frozenset({"schema", "config", "network", "optimiser"})
 """Keys that tell the training state of `trilitenet train` from other pickles."""
@@ -318,7 +330,7 @@ def _open(path: Path, *, tensors: bool) -> tuple[ModelCard, dict[str, str], dict
             ) from error
         if _is_pickle(path):
             raise WeightsError(_about_pickle(path)) from error
-        raise WeightsError(f"{path}: is not a safetensors file, or is truncated ({error})") from error
+        raise WeightsError(f"{path}: is not a safetensors file{_what_instead(path, error)}") from error
     except ValueError as error:
         raise WeightsError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
 
@@ -402,17 +414,40 @@ def _load_pickle(path: Path) -> Any:
             return torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         text = str(error)
-        found = re.search(r"(?:GLOBAL|global) (\S+)", text)
-        if found or "Unsupported" in text:
-            name = f" ({found.group(1)})" if found else ""
-            message = f"{path}: holds code or objects beside tensors{name}; it was not run, nor read"
+        if found := re.search(r"(?:GLOBAL|global) (\S+)", text):
+            message = f"{path}: holds code or objects beside tensors ({found.group(1)}); it was not run, nor read"
             raise WeightsError(message) from error
-        raise WeightsError(f"{path}: is not a PyTorch checkpoint, or is truncated") from error
+        if "Unsupported" in text and _names_code(path):
+            raise WeightsError(
+                f"{path}: holds code or objects beside tensors, or is of another pickle protocol than torch.save's "
+                "own; it was not run, nor read"
+            ) from error
+        raise WeightsError(f"{path}: is not a PyTorch checkpoint{_what_instead(path)}") from error
     except _UNREADABLE as error:
-        raise WeightsError(f"{path}: is not a PyTorch checkpoint, or is truncated") from error
+        raise WeightsError(f"{path}: is not a PyTorch checkpoint{_what_instead(path)}") from error
     except SafetensorError as error:
         what = "ends in .safetensors, but is not such a file" if called else "is a safetensors file, but is damaged"
-        raise WeightsError(f"{path}: {what}, or is truncated ({error}); copy it again") from error
+        raise WeightsError(f"{path}: {what}{_what_instead(path, error)}") from error
+
+
+def _names_code(path: Path) -> bool:
+    """Return whether a pickle names functions or classes, as that of a zipped checkpoint always does; none is run."""
+    if zipfile.is_zipfile(path):
+        return True
+    try:
+        return any(opcode.name in _NAMING for opcode, _, _ in pickletools.genops(path.read_bytes()))
+    except ValueError:  # no pickle, or cut before the first
+        return False
+
+
+def _what_instead(path: Path, error: Exception | None = None) -> str:
+    """Return the end of a message on a file that is not what it should be: what it is, as far as can be seen."""
+    with path.open("rb") as file:
+        head = file.read(256).lstrip().lower()
+    for begins, what in _IN_ITS_PLACE.items():
+        if head.startswith(begins) and not _is_safetensors(path):  # whose first bytes are a number
+            return f": it is {what}"
+    return ", or is truncated" + (f" ({error}); copy it again" if error is not None else "")
 
 
 def _read_pickle(path: Path) -> dict[str, Tensor]:

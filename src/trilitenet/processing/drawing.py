@@ -55,6 +55,10 @@ _STRIP: Final = 40_000
 memory is not given back to the system and asked for again: that took half of the time."""
 
 
+_LABELLED: Final = 192
+"""Pixels of a picture's longer side from which objects have labels: on smaller ones they cover what they name."""
+
+
 def check_parts(hide: Collection[str], known: Collection[str] = PARTS) -> frozenset[str]:
     """Return ``hide`` as a set.
 
@@ -165,8 +169,9 @@ def draw_boxes(canvas: NDArray[np.uint8], boxes: Boxes, class_names: tuple[str, 
         canvas: (height, width, 3) uint8 RGB, changed in place.
         boxes: In pixels of the canvas.
         class_names: Names of the classes.
-        labels: Write the labels too.
+        labels: Write the labels too, unless the canvas is so small that they would cover the objects.
     """
+    labels = labels and max(canvas.shape) >= _LABELLED
     thickness, beyond = line_thickness(canvas), max(canvas.shape)
     corners = np.clip(boxes.xyxy, -2 * thickness, beyond + 2 * thickness)  # OpenCV counts to 2**31
     for i in range(len(boxes) - 1, -1, -1):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 import warnings
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from PIL import ExifTags, Image
 
 from trilitenet.errors import InputError, ShapeError
 
-__all__ = ["BROKEN", "open_image", "read_image", "to_rgb", "upright_size"]
+__all__ = ["BROKEN", "no_image", "open_image", "read_image", "to_rgb", "upright_size"]
 
 
 BROKEN: Final = (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error, Image.DecompressionBombError)
@@ -69,11 +70,13 @@ def read_image(image: str | Path | bytes | Image.Image | NDArray[Any]) -> NDArra
         try:
             data = Path(image).read_bytes()
         except (FileNotFoundError, ValueError) as error:  # ValueError: a zero byte in it
+            if re.match(r"[a-z][a-z0-9+.-]+:[/\\]", name, re.IGNORECASE):  # of two slashes a Path keeps one
+                raise InputError(f"{name}: is a URL; download it first, or use `trilitenet predict`") from error
             raise InputError(f"{name}: no such file") from error
         except OSError as error:
             raise InputError(f"{name}: cannot be read ({error.strerror or error})") from error
     else:
-        raise ShapeError(f"an image is a path, bytes, a PIL image or an array, got {type(image).__name__}")
+        raise no_image(image)
     if not data:
         raise InputError(f"{name}: is empty")
     try:
@@ -84,6 +87,14 @@ def read_image(image: str | Path | bytes | Image.Image | NDArray[Any]) -> NDArra
         raise InputError(f"{name}: is not an image that can be read ({_reason(error)})") from error
     with opened:
         return _decode(opened, name)
+
+
+def no_image(value: object) -> ShapeError:
+    """Return the error of what is no image, with the cure where there is one."""
+    cure = "; pass its .read()" if hasattr(value, "read") else ""
+    if hasattr(value, "numpy"):
+        cure = "; pass its .numpy() as (height, width, 3) uint8 RGB"
+    return ShapeError(f"an image is a path, bytes, a PIL image or an array, got {type(value).__name__}{cure}")
 
 
 def open_image(file: Path | io.BytesIO) -> Image.Image:
