@@ -18,12 +18,14 @@ class Site:
         address: Of the folder.
         asked: Names of files, in order.
         fails: Name -> how often it breaks off before it comes whole.
+        busy: Names that are answered with 503.
     """
 
     def __init__(self) -> None:
         self.address = ""
         self.asked: list[str] = []
         self.fails: dict[str, int] = {}
+        self.busy: set[str] = set()
 
 
 @contextlib.contextmanager
@@ -35,7 +37,9 @@ def serving(folder: Path) -> Iterator[Site]:
         def do_GET(self) -> None:
             name = self.path.rpartition("/")[2]
             site.asked.append(name)
-            if site.fails.get(name, 0):
+            if name in site.busy:
+                self.send_error(503)
+            elif site.fails.get(name, 0):
                 site.fails[name] -= 1
                 self.send_response(200)
                 self.send_header("Content-Length", "1000000")

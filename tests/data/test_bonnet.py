@@ -9,7 +9,7 @@ import pytest
 
 from trilitenet.data.bonnet import bonnet
 from trilitenet.data.sample import Sample
-from trilitenet.data.transforms import Augmentation, TrainTransform
+from trilitenet.data.transforms import Augmentation, TrainTransform, shrink
 from trilitenet.errors import ConfigError
 
 SIZE = (180, 320)
@@ -75,6 +75,16 @@ def test_a_task_without_labels_stays_without() -> None:
     assert after.lane is None
     assert after.drivable is not None
     assert after.drivable.min() == 0
+
+
+def test_a_prepared_sample_draws_the_same() -> None:
+    transform = TrainTransform((96, 160), Augmentation(bonnet=1.0))
+    for seed in range(10):
+        whole = transform(road(), np.random.default_rng(seed))
+        prepared = transform(shrink(road(), (96, 160), 1), np.random.default_rng(seed))
+        assert np.array_equal(whole.image, prepared.image)
+        assert np.array_equal(np.asarray(whole.drivable), np.asarray(prepared.drivable))
+        assert np.array_equal(np.asarray(whole.boxes), np.asarray(prepared.boxes))
 
 
 def test_it_is_drawn_as_often_as_asked_for_and_off_by_default() -> None:

@@ -343,6 +343,10 @@ def test_a_data_set_at_an_address_is_opened_like_a_folder(
         other = open_dataset(address, "train", cache=tmp_path / "cache")
         with pytest.raises(DataError, match=r"/train-000000\.tar: cannot be fetched \(999990 bytes are missing at"):
             other[0]
+        site.busy = {"prepared.json"}
+        with pytest.raises(DataError, match=r"/prepared\.json: cannot be fetched \(HTTP Error 503: [^)]*\)$"):
+            open_dataset(address, "train", cache=tmp_path / "none")
+        site.busy = set()
         with pytest.raises(DataError, match=r"/no/prepared\.json: cannot be fetched \(HTTP Error 404: .*\); give the"):
             open_dataset(f"{site.address}/no", "train")
     there.copy()
@@ -351,6 +355,24 @@ def test_a_data_set_at_an_address_is_opened_like_a_folder(
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match=r"file.*: cannot be written"):
         open_dataset(address, "train", cache=tmp_path / "file" / "cache")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
+def test_a_shard_for_which_there_is_no_room_is_asked_for_once(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepare(root, tmp_path / "out", canvas=CANVAS)
+    plain = Path.open
+    with serving(tmp_path / "out") as site:
+        dataset = PreparedDataset(site.address, "val", cache=tmp_path / "copies")
+
+        def full(path: Path, *options: Any, **more: Any) -> Any:
+            return plain(Path("/dev/full") if path.suffix == ".part" else path, *options, **more)
+
+        monkeypatch.setattr(Path, "open", full)
+        with pytest.raises(OutputError, match="No space left"):
+            dataset[0]
+        assert site.asked.count("val-000000.tar") == 1
 
 
 def test_a_shard_is_copied_once_whoever_wants_it(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

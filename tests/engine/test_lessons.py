@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from trilitenet.data.prepared import shrink
 from trilitenet.data.sample import Sample
-from trilitenet.data.transforms import Augmentation, TrainTransform
+from trilitenet.data.transforms import Augmentation, TrainTransform, shrink
 from trilitenet.engine.lessons import Lessons, TaughtTransform
 from trilitenet.engine.predictions import DETECTIONS_FILE, PredictionWriter
 from trilitenet.errors import ConfigError, DataError

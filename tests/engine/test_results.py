@@ -17,7 +17,8 @@ def test_page_shows_curves_facts_and_pictures(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     logger = CsvLogger(tmp_path / "metrics.csv")
     for step in (1, 2, 3):
-        logger.log({"train/total": 1 / step, "lr": 0.1, "val/lane/iou": step / 10}, step)
+        learned = {"train/weight_lane": 90.0}
+        logger.log({"train/total": 1 / step, "lr": 0.1, "val/lane/iou": step / 10, **learned}, step)
     logger.close()
     image = np.full((20, 30, 3), 40, np.uint8)
     page = write_results(
@@ -31,7 +32,7 @@ def test_page_shows_curves_facts_and_pictures(tmp_path: Path) -> None:
     assert "A &lt;run&gt;" in text
     assert '<meta name="viewport"' in text  # else a phone shows it as small as a desktop's
     assert "road &amp; sky" in text
-    for name in ("losses.png", "metrics.png", "learning-rate.png", "labels-0.jpg", "prediction-0.jpg"):
+    for name in ("losses.png", "balance.png", "metrics.png", "learning-rate.png", "labels-0.jpg", "prediction-0.jpg"):
         assert name in text
         assert (page.parent / name).stat().st_size > 300
     shades = [np.asarray(Image.open(page.parent / f"{what}-0.jpg")).mean() for what in ("labels", "prediction")]

@@ -54,7 +54,8 @@ from trilitenet.data.reading import (
     label_file,
     split_folders,
 )
-from trilitenet.data.sample import BOXES, MASKS, VALID, Sample
+from trilitenet.data.sample import MASKS, VALID, Sample
+from trilitenet.data.transforms import shrink
 from trilitenet.errors import (
     Claim,
     ConfigError,
@@ -66,14 +67,13 @@ from trilitenet.errors import (
     writing,
 )
 from trilitenet.processing.cores import ProcessPool
-from trilitenet.processing.letterbox import Letterbox
 
 try:
     import fcntl
 except ModuleNotFoundError:  # on Windows
     fcntl = None  # type: ignore[assignment]
 
-__all__ = ["PreparedDataset", "default_cache", "is_prepared", "open_dataset", "prepare", "shrink"]
+__all__ = ["PreparedDataset", "default_cache", "is_prepared", "open_dataset", "prepare"]
 
 _LOGGER: Final = logging.getLogger(__name__)
 
@@ -108,30 +108,6 @@ class _Plan:
     images: Literal["jpeg", "raw"]
     quality: int
     mask_above: int
-
-
-def shrink(sample: Sample, canvas: tuple[int, int], mask_above: int = 1) -> Sample:
-    """Resize a sample to fit a canvas, without padding: what the training transform does first.
-
-    Args:
-        sample: Of any size.
-        canvas: (height, width) in pixels.
-        mask_above: An area-resized mask pixel (0 to 255) above this is foreground.
-    """
-    box = Letterbox.fit(sample.size, canvas=canvas)
-    height, width = box.resized
-    if (height, width) == sample.size:
-        return sample
-    bare = dataclasses.replace(box, canvas=box.resized, top=0, left=0)
-    factor = np.array([width / sample.size[1], height / sample.size[0]] * 2)
-
-    return dataclasses.replace(
-        sample,
-        image=bare.image(sample.image),
-        **sample.changed(BOXES, lambda boxes: (boxes * factor).astype(np.float32)),
-        **sample.changed(MASKS, lambda mask: bare.mask(mask.view(np.bool_), mask_above)),
-        **sample.changed(VALID, lambda valid: bare.mask(~valid) == 0),
-    )
 
 
 def prepare(
@@ -527,10 +503,13 @@ def _fetch(root: str, name: str, path: Path) -> str:
     while True:
         try:
             return _copy(urllib.request.urlopen(url, timeout=_PATIENCE) if by_http else _open_other(url), path)
+        except OutputError:
+            raise
         except urllib.error.HTTPError as error:
-            if not (pauses and (error.code >= 500 or error.code in _BUSY)):
-                cure = "give the address of a folder that `trilitenet data prepare` has written"
-                raise DataError(f"{url}: cannot be fetched ({error}); {cure}") from error
+            busy = error.code >= 500 or error.code in _BUSY
+            if not (busy and pauses):
+                cure = "" if busy else "; give the address of a folder that `trilitenet data prepare` has written"
+                raise DataError(f"{url}: cannot be fetched ({error}){cure}") from error
         except (OSError, ValueError, http.client.HTTPException) as error:
             if not pauses:
                 reason = error.reason if isinstance(error, urllib.error.URLError) else error
@@ -548,12 +527,18 @@ def _copy(source: Any, path: Path) -> str:
 
     Raises:
         OSError: If it ends early.
+        OutputError: If the file cannot be written, which asking again does not mend.
     """
     digest = hashlib.sha256()
-    with source, path.open("wb") as target:
-        while data := source.read(1 << 20):
-            target.write(data)
-            digest.update(data)
+    with source:
+        with writing(path):
+            target = path.open("wb")
+        with target:
+            while data := source.read(1 << 20):
+                with writing(path):
+                    target.write(data)
+                    target.flush()
+                digest.update(data)
     if missing := getattr(source, "length", None):  # of what an HTTP server announced
         raise OSError(f"{missing} bytes are missing at its end")
     return digest.hexdigest()

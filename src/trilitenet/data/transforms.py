@@ -38,6 +38,7 @@ __all__ = [
     "mixup",
     "mosaic",
     "shift_hsv",
+    "shrink",
     "warp",
 ]
 
@@ -160,6 +161,30 @@ def draw_affine(rng: np.random.Generator, strength: Augmentation) -> Affine:
         scale=1 + (2 * scale - 1) * strength.scale,
         shift=((2 * x - 1) * strength.translation, (2 * y - 1) * strength.translation),
         flip=bool(mirrored < strength.flip),
+    )
+
+
+def shrink(sample: Sample, canvas: tuple[int, int], mask_above: int = 1) -> Sample:
+    """Resize a sample to fit a canvas, without padding: what the training transform does first.
+
+    Args:
+        sample: Of any size.
+        canvas: (height, width) in pixels.
+        mask_above: An area-resized mask pixel (0 to 255) above this is foreground.
+    """
+    box = Letterbox.fit(sample.size, canvas=canvas)
+    height, width = box.resized
+    if (height, width) == sample.size:
+        return sample
+    bare = dataclasses.replace(box, canvas=box.resized, top=0, left=0)
+    factor = np.array([width / sample.size[1], height / sample.size[0]] * 2)
+
+    return dataclasses.replace(
+        sample,
+        image=bare.image(sample.image),
+        **sample.changed(BOXES, lambda boxes: (boxes * factor).astype(np.float32)),
+        **sample.changed(MASKS, lambda mask: bare.mask(mask.view(np.bool_), mask_above)),
+        **sample.changed(VALID, lambda valid: bare.mask(~valid) == 0),
     )
 
 
@@ -327,7 +352,8 @@ class TrainTransform:
 
     def _warp(self, sample: Sample, rng: np.random.Generator) -> Sample:
         if self.strength.bonnet and rng.random() < self.strength.bonnet:
-            sample = bonnet(sample, rng)
+            # At the canvas's size, so that a prepared sample draws the same.
+            sample = bonnet(shrink(sample, self.canvas, self.strength.mask_above), rng)
         return warp(sample, draw_affine(rng, self.strength), self.canvas, self.strength.mask_above)
 
     def _mosaic(

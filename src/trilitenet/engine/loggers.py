@@ -207,7 +207,7 @@ class WandbLogger(_ServerLogger):
         )
         self.run_id = self._run.id
         # It would leave out a figure of a step before its own latest one, as of a validation that is done anew.
-        self._run.define_metric("*", step_metric="step")
+        self._try(lambda: self._run.define_metric("*", step_metric="step"))
 
     def _log(self, values: dict[str, float], step: int) -> None:
         self._run.log({**values, "step": step})

@@ -18,6 +18,8 @@ from trilitenet.errors import import_extra, write_file
 
 __all__ = ["write_results"]
 
+_BALANCE: Final = "train/weight_"
+"""What names of learned weights of the tasks begin with, which are no losses."""
 _STYLE: Final = (
     "body{font:16px/1.5 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem}"
     "img{max-width:100%}table{border-collapse:collapse}td,th{padding:.2rem .8rem;text-align:left}"
@@ -55,7 +57,8 @@ def write_results(
         steps.append(step)
         values.append(value)
     groups = {
-        "losses": [name for name in curves if name.startswith("train/")],
+        "losses": [name for name in curves if name.startswith("train/") and not name.startswith(_BALANCE)],
+        "balance": [name for name in curves if name.startswith(_BALANCE)],
         "metrics": [name for name in curves if name.startswith("val/")],
         "learning-rate": [name for name in curves if name == "lr"],
     }

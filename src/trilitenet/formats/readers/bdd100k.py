@@ -486,8 +486,10 @@ def _survey(root: Path) -> tuple[dict[str, Path], list[Path]]:
 def _images(folders: dict[str, Path], split: str) -> dict[str, Path]:
     """Return image name -> path of a split: those in its folder and in all below, but in folders of another split.
 
+    Of one name, that in a folder above others counts: below it are small copies, or pictures of its labels.
+
     Raises:
-        DataError: If two images have one name.
+        DataError: If two images have one name, neither in a folder above the other.
     """
     others = "|".join(other for other in BDD100K_SPLITS if other != split)
     for pattern in (f"images/100k/{split}", f"100k/{split}", f"images/{split}", split):
@@ -500,7 +502,8 @@ def _images(folders: dict[str, Path], split: str) -> dict[str, Path]:
                 for path in visible(folder.iterdir()):
                     if path.suffix.lower() in IMAGE_ENDINGS[:2]:
                         first = images.setdefault(path.stem, path)
-                        if first.stat().st_size != path.stat().st_size:  # else it is a copy
+                        copy = first.parent in path.parents or first.stat().st_size == path.stat().st_size
+                        if first != path and not copy:
                             raise same_name(path.stem, split, first, path)
         if images:
             return images
