@@ -7,7 +7,7 @@ import json
 import logging
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -19,12 +19,17 @@ from trilitenet.config import STRIDES, TASKS, ModelCard, check_size, parse, read
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.evaluate import BestThresholds, best_thresholds
 from trilitenet.engine.evaluate import evaluate as run_evaluation
+from trilitenet.engine.figures import CONDITION_FIGURES
+from trilitenet.engine.report import Report
 from trilitenet.errors import ConfigError, DataError, OutputError, scratch_folder
 from trilitenet.models.weights import import_published, load_network, read_card, resolve_weights, save_network
 
 __all__ = ["CardText", "finish", "import_weights", "info"]
 
 _LOGGER: Final = logging.getLogger(__name__)
+_LOW: Final = ", 95% from"
+_HIGH: Final = ", 95% to"
+"""What ends the names of a figure's interval among a card's metrics."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +96,8 @@ def finish(
     """Finish trained weights for use: fix the thresholds on a split, measure them there, write fp16 with the card.
 
     The threshold of each task is the one that does best on the split (F1 of boxes at IoU 0.5, IoU of both masks). The
-    figures are those of the file as it is written, under the protocol fair.
+    figures are those of the file as it is written, under the protocol fair, with 95% intervals by sequence, and by
+    condition (weather, scene, time of day) with how many images that is.
 
     Args:
         source: Trained weights, for example runs/tiny/final.safetensors.
@@ -143,16 +149,42 @@ def finish(
                 predictor,
                 dataset,
                 batch_size=batch_size,
-                resamples=0,
                 worst=0,
                 progress=shown,
                 about={"model": str(destination), "data": str(data), "split": split},
             )
-        figures = {f"{split} {name}": round(figure.value, 4) for name, figure in report.figures.items()}
-        finished = dataclasses.replace(described, thresholds=best.thresholds, metrics=figures)
+        finished = dataclasses.replace(described, thresholds=best.thresholds, metrics=_card_metrics(report, split))
         save_network(trained, destination, finished, half=not full)
     sys.stdout.write(f"{report.summary()}\nwritten to {destination}\n")
     return finished
+
+
+def _card_metrics(report: Report, split: str) -> dict[str, float]:
+    """Return what a card says of a report: figures, their intervals, and the foremost by condition."""
+    metrics: dict[str, float] = {f"{split} images": report.provenance.images}
+    for name, figure in report.figures.items():
+        metrics[f"{split} {name}"] = figure.value
+        if figure.low is not None and figure.high is not None:
+            metrics |= {f"{split} {name}{_LOW}": figure.low, f"{split} {name}{_HIGH}": figure.high}
+    for condition in report.conditions:
+        where = f", {condition.attribute} {condition.value}"
+        metrics[f"{split} images{where}"] = condition.images
+        metrics |= {
+            f"{split} {name}{where}": condition.figures[name]
+            for name in CONDITION_FIGURES["fair"]
+            if name in condition.figures
+        }
+    return {name: round(value, 4) for name, value in metrics.items() if not math.isnan(value)}
+
+
+def _with_intervals(metrics: Mapping[str, float]) -> list[tuple[str, str]]:
+    """Return a line for each of a card's metrics, its interval behind it."""
+    lines = []
+    for name, value in metrics.items():
+        low, high = metrics.get(name + _LOW), metrics.get(name + _HIGH)
+        if not name.endswith((_LOW, _HIGH)):
+            lines.append((name, f"{value:g}" + ("" if low is None or high is None else f" (95%: {low:g} to {high:g})")))
+    return lines
 
 
 def _check_destination(path: Path, *, overwrite: bool) -> None:
@@ -221,7 +253,7 @@ def info(file: NameOrPath, /, *, json_output: bool = False) -> ModelCard:
             f"lane {thresholds.lane:g}",
         ),
         *(("trained on", line) for line in card.training_data),
-        *((name, f"{value:g}") for name, value in card.metrics.items()),
+        *_with_intervals(card.metrics),
         *((name, value) for name, value in card.provenance.items()),
         ("licence", card.licence),
         *(("note", line) for line in card.notes),
