@@ -2,6 +2,7 @@
 
     python benchmarks/speed.py --rounds 30
     python benchmarks/speed.py --weights tiny --threads 1 --cpu-time   # a busy machine: processor time, not wall time
+    python benchmarks/speed.py --weights tiny --layout vectors-tiny vectors-small   # layouts in turn
 
 'Plain' is the network as it is, traced to ONNX with float input and logits out: no decoding, no thresholds. 'Deploy'
 takes pixels and gives decoded boxes and decided masks. OpenVINO computes in bf16 where the processor has it, else in
@@ -13,6 +14,7 @@ Ratios are medians over the rounds of plain time / own time, and in calm of the 
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import tempfile
 import time
@@ -114,10 +116,14 @@ def measure(weights: str, arguments: argparse.Namespace, folder: Path) -> dict[s
     variant = network.card.variant
     plain = plain_onnx(network)
     plain_model = CORE.read_model(plain, b"")
-    auto = pick_layout(arguments.layout, variant, "openvino", unit=vector_unit())
     info = ArtefactInfo("openvino", "bf16", SIZE)
-    proto = build_onnx(DeployGraph(network, auto), network.card, info)
-    deploy = build_openvino(proto)
+    names = list(dict.fromkeys(arguments.layout))
+    endings = {name: "" if len(names) == 1 else f", {name}" for name in names}
+    layouts = {name: pick_layout(name, variant, "openvino", unit=vector_unit()) for name in names}
+    deploy = {
+        name: build_openvino(build_onnx(DeployGraph(network, layout), network.card, info))
+        for name, layout in layouts.items()
+    }
     threads = arguments.threads
     if threads is not None:
         torch.set_num_threads(threads)
@@ -127,11 +133,13 @@ def measure(weights: str, arguments: argparse.Namespace, folder: Path) -> dict[s
     calls: dict[str, Callable[[], object]] = {}
     for precision in dict.fromkeys((OWN, "fp32")):
         calls[f"plain openvino {precision}"] = openvino_call(plain_model, precision, threads)
-        calls[f"deploy openvino {precision}"] = openvino_call(deploy, precision, threads)
+        for name, ending in endings.items():
+            calls[f"deploy openvino {precision}{ending}"] = openvino_call(deploy[name], precision, threads)
     if arguments.int8:
         frames = list(np.random.default_rng(0).integers(0, 256, (8, 1, *SIZE, 3), np.uint8))
-        quantised = quantize_openvino(deploy, frames, KEEP_STEPS[1])
-        calls[f"deploy openvino int8 + {OWN}"] = openvino_call(quantised, OWN, threads)
+        for name, ending in endings.items():
+            quantised = quantize_openvino(deploy[name], frames, KEEP_STEPS[1])
+            calls[f"deploy openvino int8 + {OWN}{ending}"] = openvino_call(quantised, OWN, threads)
     if arguments.eager:
         zeros = torch.zeros(1, 3, *SIZE)
 
@@ -147,16 +155,19 @@ def measure(weights: str, arguments: argparse.Namespace, folder: Path) -> dict[s
         calls["deploy onnxruntime fp32"] = onnxruntime_call(data, threads)
     if arguments.streams:
         calls[PLAIN_STREAMS] = openvino_call(plain_model, OWN, threads, 2)
-        calls[f"deploy openvino {OWN}, 8 frames on 2 streams"] = openvino_call(deploy, OWN, threads, 2)
+        for name, ending in endings.items():
+            entry = f"deploy openvino {OWN}, 8 frames on 2 streams{ending}"
+            calls[entry] = openvino_call(deploy[name], OWN, threads, 2)
     if arguments.frame:
-        big = DeployGraph(network, auto, mask_scale=2, thresholds=Thresholds())
-        path = folder / f"{variant}.xml"
-        doubled = ArtefactInfo("openvino", "bf16", SIZE, mask_scale=2)
-        save_openvino(build_openvino(build_onnx(big, network.card, doubled)), path, network.card, doubled)
-        predictor = Predictor(OpenVINOBackend(path, threads=threads))
         calls["plain frame"] = lambda: plain_frame(network, image, argmax=True)
         calls["plain frame, comparing"] = lambda: plain_frame(network, image, argmax=False)
-        calls["deploy frame"] = lambda: predictor.perceive([image])
+        doubled = ArtefactInfo("openvino", "bf16", SIZE, mask_scale=2)
+        for index, name in enumerate(names):
+            big = DeployGraph(network, layouts[name], mask_scale=2, thresholds=Thresholds())
+            path = folder / f"{variant}-{index}.xml"
+            save_openvino(build_openvino(build_onnx(big, network.card, doubled)), path, network.card, doubled)
+            predictor = Predictor(OpenVINOBackend(path, threads=threads))
+            calls[f"deploy frame{endings[name]}"] = functools.partial(predictor.perceive, [image])
 
     clock = time.process_time if arguments.cpu_time else time.perf_counter
     times: dict[str, list[float]] = {name: [] for name in calls}
@@ -195,7 +206,9 @@ def main() -> None:
     parser.add_argument("--image", type=Path, help="of the whole frames; a synthetic 1280x720 one by default")
     parser.add_argument("--rounds", type=int, default=30)
     parser.add_argument("--threads", type=int)
-    parser.add_argument("--layout", default="auto", choices=["auto", *LAYOUTS])
+    parser.add_argument(
+        "--layout", nargs="+", default=["auto"], choices=["auto", *LAYOUTS], help="of OpenVINO's deploy graphs, in turn"
+    )
     parser.add_argument("--cpu-time", action="store_true", help="processor time instead of wall time")
     for part in ("eager", "onnxruntime", "streams", "frame", "int8"):
         parser.add_argument(f"--no-{part}", dest=part, action="store_false")
@@ -206,9 +219,10 @@ def main() -> None:
         for weights in arguments.weights:
             results[weights] = measure(weights, arguments, Path(folder))
             print(f"{weights}: milliseconds p10, p50, p99; plain / own, in calm")
+            width = max(45, *map(len, results[weights]))
             for name, row in results[weights].items():
                 times = " ".join(f"{row[key]:8.2f}" for key in ("p10", "p50", "p99"))
-                print(f"  {name:45s} {times}  {row['ratio']:5.2f}  {row['calm']:5.2f}", flush=True)
+                print(f"  {name:{width}s} {times}  {row['ratio']:5.2f}  {row['calm']:5.2f}", flush=True)
     if arguments.output:
         arguments.output.write_text(json.dumps(results, indent=2) + "\n")
 

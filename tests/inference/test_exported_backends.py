@@ -244,6 +244,106 @@ def test_an_interruption_leaves_every_request_idle(artefacts: Artefacts) -> None
     assert len(lane) == len(images)
 
 
+def any_size(folder: Path) -> Path:
+    """Write an artefact of any size: its lane is where a pixel's red, green and blue are above 100 on average."""
+    openvino = pytest.importorskip("openvino")
+    from trilitenet.deploy.openvino import save_openvino
+
+    ops = openvino.opset13
+    image = ops.parameter(openvino.PartialShape([1, -1, -1, 3]), np.uint8, "image")
+    mean = ops.reduce_mean(ops.convert(image, "f32"), np.array([3]))
+    lane = ops.convert(ops.greater(mean, np.float32(100)), "u8")
+    lane.output(0).set_names({"lane"})
+    card, info = ModelCard("tiny", tasks=("lane",)), ArtefactInfo("openvino", size=None)
+    save_openvino(openvino.Model([ops.result(lane)], [image], "g"), folder / "any.xml", card, info)
+    return folder / "any.xml"
+
+
+def check_lane(backend: OpenVINOBackend, height: int, width: int, count: int = 1) -> None:
+    """Run the artefact of `any_size` on images of a size, and check what it returns."""
+    images = np.random.default_rng(height + width).integers(0, 256, (count, height, width, 3), np.uint8)
+    lane = backend.run(images).lane
+    assert lane is not None
+    np.testing.assert_array_equal(lane, 255 * (images.mean(3) > 100))
+
+
+def compiled_for(backend: OpenVINOBackend) -> list[tuple[int, ...]]:
+    """Return the shapes for which an idle backend is compiled, the one last used last, and check its requests."""
+    assert backend._idle is not None
+    request = backend._idle.get()
+    backend._idle.put(request)
+    for shape, requests in request._sizes._requests.items():
+        assert len(requests) == backend._idle.qsize()
+        assert all(tuple(each.get_compiled_model().inputs[0].shape) == shape for each in requests)
+    return list(request._sizes._requests)
+
+
+def test_a_size_that_keeps_coming_is_compiled_for(tmp_path: Path) -> None:
+    backend = OpenVINOBackend(any_size(tmp_path), threads=1)
+    assert backend.canvas is None
+    assert backend._idle is not None
+    request = backend._idle.get()
+    backend._idle.put(request)
+    plain = request._request
+    for times in range(1, 9):  # by turns, as photos of two forms come
+        for size in ((64, 96), (96, 64)):
+            check_lane(backend, *size)
+            assert (request._used is plain) == (times < 5)
+    assert compiled_for(backend) == [(1, 64, 96, 3), (1, 96, 64, 3)]
+    assert request._used is request._sizes._requests[1, 96, 64, 3][0]
+    check_lane(backend, 64, 96)
+    assert compiled_for(backend) == [(1, 96, 64, 3), (1, 64, 96, 3)]
+    check_lane(backend, 32, 32, count=7)
+    for width in (64, 96, 128):
+        check_lane(backend, 32, width, count=5)
+    assert compiled_for(backend) == [(1, 32, width, 3) for width in (32, 64, 96, 128)]  # those longest unused are gone
+    again = pickle.loads(pickle.dumps(backend))  # noqa: S301 - its own
+    backend.close()
+    with pytest.raises(BackendError, match="the model was closed"):
+        check_lane(backend, 32, 32)
+    check_lane(again, 32, 32, count=5)
+    assert compiled_for(again) == [(1, 32, 32, 3)]
+
+
+def test_sizes_that_seldom_come_are_not_compiled_for(tmp_path: Path) -> None:
+    backend = OpenVINOBackend(any_size(tmp_path), threads=1)
+    for _ in range(8):
+        for width in (32, 64, 96, 128):
+            check_lane(backend, 64, width)
+    assert not compiled_for(backend)
+
+
+def test_a_size_that_cannot_be_compiled_for_is_computed_all_the_same(tmp_path: Path) -> None:
+    class Model:
+        def clone(self) -> Any:
+            raise RuntimeError("Failed to allocate")
+
+    backend = OpenVINOBackend(any_size(tmp_path), threads=1)
+    assert backend._idle is not None
+    request = backend._idle.get()
+    backend._idle.put(request)
+    request._sizes._model = Model()
+    for _ in range(7):
+        check_lane(backend, 64, 96)
+    assert request._used is request._request
+
+
+def test_threads_may_bring_images_of_several_sizes(tmp_path: Path) -> None:
+    backend = OpenVINOBackend(any_size(tmp_path), streams=2, threads=4)
+    sizes = [(32, 32, 1), (64, 32, 3), (32, 96, 2), (64, 96, 1), (32, 64, 1)]
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda size: check_lane(backend, *size), sizes * 20))
+        assert 0 < len(compiled_for(backend)) <= 4
+        before = compiled_for(backend)
+        with backend.in_parallel() as runners:
+            assert runners == 4
+            assert not compiled_for(backend)
+            list(pool.map(lambda size: check_lane(backend, *size), sizes * 20))
+            assert 0 < len(compiled_for(backend)) <= 4
+    assert compiled_for(backend) == before
+    check_lane(backend, *SIZE)
+
+
 @pytest.mark.parametrize("kind", [OnnxBackend, OpenVINOBackend])
 def test_a_closed_model_says_so(artefacts: Artefacts, kind: Any) -> None:
     backend = kind(artefacts.folder / "model.onnx")

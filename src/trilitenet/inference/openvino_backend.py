@@ -10,9 +10,9 @@ import os
 import queue
 import re
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +27,18 @@ __all__ = ["OpenVINOBackend", "openvino_core"]
 
 _FIRST_USE = threading.Lock()
 _HINTS = {"fp32": "f32", "fp16": "f16", "bf16": "bf16"}
+_LATEST: Final = 16
+"""Of so many images the sizes are remembered, where an artefact takes any size."""
+_OFTEN: Final = 5
+"""A size that so many of these have is compiled for: no more than a warm-up runs, and mixed photos seldom have it."""
+_SIZES: Final = 4
+"""So many sizes stay compiled, each of which takes memory; the one longest unused makes room."""
 
 
 class OpenVINOBackend(ArtefactBackend):
     """An artefact of ``trilitenet export --format openvino`` (or ``onnx``) on OpenVINO.
+
+    One that takes any size is slower than one of a fixed size, so it is compiled again for a size that keeps coming.
 
     Args:
         path: The ``.xml`` file, with its ``.bin`` beside it, or an ``.onnx`` file.
@@ -112,11 +120,11 @@ class OpenVINOBackend(ArtefactBackend):
         self._path, self._file = path, path.absolute()  # which stays the same where the process changes its folder
         self.streams = streams
         self._process = os.getpid()
-        compiled = self._compile(streams)
-        self._outputs = [output.get_any_name() for output in compiled.outputs]
-        self._idle: queue.SimpleQueue[Any] | None = _requests(compiled, streams)
+        self._outputs = [output.get_any_name() for output in model.outputs]
+        self._idle: queue.SimpleQueue[Any] | None = self._requests(streams)
 
-    def _compile(self, streams: int) -> Any:
+    def _requests(self, streams: int) -> queue.SimpleQueue[Any]:
+        """Compile the model for so many streams; return a request of each that is free to be used."""
         options: dict[str, Any] = {
             "INFERENCE_PRECISION_HINT": _HINTS[self.precision],
             "PERFORMANCE_HINT": "LATENCY" if streams == 1 else "THROUGHPUT",
@@ -125,12 +133,23 @@ class OpenVINOBackend(ArtefactBackend):
             options["NUM_STREAMS"] = str(streams)
             if self._threads is not None:
                 options["INFERENCE_NUM_THREADS"] = self._threads
-        try:
-            return self._core.compile_model(self._model, self._device, options)
-        except RuntimeError as error:
-            raise BackendError(
-                f"{self._path}: OpenVINO cannot compile it for {self._device} ({gist(error)})"
-            ) from error
+        core, device, path = self._core, self._device, self._path  # not self, which would hold itself by its requests
+
+        def make(model: Any) -> list[Any]:
+            try:
+                compiled = core.compile_model(model, device, options)
+                return [compiled.create_infer_request() for _ in range(streams)]
+            except RuntimeError as error:
+                raise BackendError(f"{path}: OpenVINO cannot compile it for {device} ({gist(error)})") from error
+
+        requests = make(self._model)
+        if self.info.size is None:
+            sizes = _Sizes(self._model, make)
+            requests = [_AnySize(request, stream, sizes) for stream, request in enumerate(requests)]
+        idle: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        for request in requests:
+            idle.put(request)
+        return idle
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle it as what opens it again: its file, which must be there, and its options."""
@@ -187,7 +206,7 @@ class OpenVINOBackend(ArtefactBackend):
         if count <= self.streams:
             yield self.streams
             return
-        with replaced(self, "_idle", lambda: _requests(self._compile(count), count)):
+        with replaced(self, "_idle", lambda: self._requests(count)):
             yield count
 
     def close(self) -> None:
@@ -209,12 +228,75 @@ def openvino_core(openvino: Any) -> Any:
     return openvino.Core()
 
 
-def _requests(compiled: Any, count: int) -> queue.SimpleQueue[Any]:
-    """Return so many requests that are free to be used."""
-    idle: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    for _ in range(count):
-        idle.put(compiled.create_infer_request())
-    return idle
+class _Sizes:
+    """The sizes for which a model that takes any is compiled as well. Several threads may use it at once.
+
+    Args:
+        model: The model.
+        make: Compiles a model; returns a request for each stream.
+    """
+
+    def __init__(self, model: Any, make: Callable[[Any], list[Any]]) -> None:
+        self._model, self._make = model, make
+        self._latest: collections.deque[tuple[int, ...]] = collections.deque(maxlen=_LATEST)
+        self._requests: collections.OrderedDict[tuple[int, ...], list[Any]] = collections.OrderedDict()
+        self._lock, self._compiling = threading.Lock(), threading.Lock()
+
+    def find(self, shape: tuple[int, ...]) -> list[Any]:
+        """Return the requests for inputs of a shape, one a stream; none where it is not compiled for."""
+        with self._lock:
+            self._latest.append(shape)
+            if shape in self._requests:
+                self._requests.move_to_end(shape)
+                return self._requests[shape]
+            if self._latest.count(shape) < _OFTEN or not self._compiling.acquire(blocking=False):
+                return []  # while one thread compiles, others compute without
+        try:
+            made = self._compile(shape)
+            with self._lock:
+                while len(self._requests) >= _SIZES:
+                    self._requests.popitem(last=False)
+                self._requests[shape] = made
+        finally:
+            self._compiling.release()
+        return made
+
+    def _compile(self, shape: tuple[int, ...]) -> list[Any]:
+        """Return the requests for a shape; none where it cannot be compiled for, as where memory does not do."""
+        try:
+            model = self._model.clone()
+            model.reshape(list(shape))
+            return self._make(model)
+        except (BackendError, RuntimeError):  # the model for any size goes on
+            return []
+
+
+class _AnySize:
+    """A stream's request of a model that takes any size, which hands inputs of a size compiled for to that one's.
+
+    Args:
+        request: The request for any size.
+        stream: Number of the stream, which computes one image at a time, whatever its size.
+        sizes: The requests for sizes that keep coming.
+    """
+
+    def __init__(self, request: Any, stream: int, sizes: _Sizes) -> None:
+        self._request = self._used = request
+        self._stream, self._sizes = stream, sizes
+
+    def start_async(self, inputs: Sequence[NDArray[Any]], share_inputs: bool = False) -> None:
+        """Start to compute one image."""
+        requests = self._sizes.find(inputs[0].shape)
+        self._used = requests[self._stream] if requests else self._request
+        self._used.start_async(inputs, share_inputs=share_inputs)
+
+    def wait(self) -> None:
+        """Wait until it is computed."""
+        self._used.wait()
+
+    def get_output_tensor(self, index: int) -> Any:
+        """Return an output of it."""
+        return self._used.get_output_tensor(index)
 
 
 def _check_weights(path: Path) -> None:
