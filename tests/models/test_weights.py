@@ -270,6 +270,7 @@ def test_import_refuses_what_is_not_a_checkpoint(golden: dict[str, NDArray[Any]]
         pickled = pickle.dumps({"a": _Code(tmp_path / "touched")}, protocol=protocol)
         (tmp_path / f"code{protocol}.pth").write_bytes(pickled)
     torch.save(state, tmp_path / "newer.pth", pickle_protocol=4)
+    torch.save(state, tmp_path / "older.pth", pickle_protocol=4, _use_new_zipfile_serialization=False)
     torch.save({"zip": _Code(tmp_path / "touched")}, tmp_path / "zipcode.pth")
     torch.save([1, 2], tmp_path / "list.pth")
     torch.save({"conv.weight": torch.zeros(1)}, tmp_path / "foreign.pth")
@@ -296,6 +297,7 @@ def test_import_refuses_what_is_not_a_checkpoint(golden: dict[str, NDArray[Any]]
         "plain.pth": "is not a PyTorch checkpoint, or is truncated",
         **{f"code{protocol}.pth": "holds code" for protocol in range(6)},
         "newer.pth": "or is of another pickle protocol than torch.save's own",
+        "older.pth": "or is of another pickle protocol than torch.save's own",
         "zipcode.pth": "holds code",
         "list.pth": "not a state dict",
         "foreign.pth": "not a published TriLiteNet checkpoint",
@@ -317,13 +319,22 @@ def test_import_refuses_what_is_not_a_checkpoint(golden: dict[str, NDArray[Any]]
 
 def test_a_cut_or_damaged_checkpoint_of_the_older_format_is_named(tmp_path: Path) -> None:
     path = tmp_path / "old.pth"
-    torch.save({"a": torch.zeros(4)}, path, _use_new_zipfile_serialization=False)
-    whole = path.read_bytes()
-    for length in range(1, len(whole), 3):
-        for rest in (b"", b"\0" + whole[length + 1 :]):
-            path.write_bytes(whole[:length] + rest)
-            with pytest.raises(WeightsError, match=r"old\.pth: "):
-                import_published(path, tmp_path / "out.safetensors")
+    for protocol in (2, 4):
+        torch.save({"a": torch.zeros(4)}, path, pickle_protocol=protocol, _use_new_zipfile_serialization=False)
+        whole = path.read_bytes()
+        for length in range(1, len(whole), 3):
+            for rest in (b"", b"\0" + whole[length + 1 :]):
+                path.write_bytes(whole[:length] + rest)
+                with pytest.raises(WeightsError, match=r"old\.pth: "):
+                    import_published(path, tmp_path / "out.safetensors")
+
+
+@pytest.mark.parametrize("length", [2**55, 2**63 - 1])
+def test_a_pickle_that_claims_a_text_longer_than_memory_is_named(tmp_path: Path, length: int) -> None:
+    path = tmp_path / "long.pth"
+    path.write_bytes(b"\x80\x04\x95" + bytes(8) + b"\x8d" + length.to_bytes(8, "little") + b"text")
+    with pytest.raises(WeightsError, match="is not a PyTorch checkpoint"):
+        import_published(path, tmp_path / "out.safetensors")
 
 
 def _with(dtype: torch.dtype) -> Callable[[Tensor], Tensor]:

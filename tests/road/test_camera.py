@@ -338,3 +338,14 @@ def test_a_video_is_not_contradicted_by_few_frames() -> None:
     for frame in range(24, 60):
         calibration.update(lines, frame / 10, _cars(mounted, (12.0, 0.0)))
     assert calibration.camera is not None
+
+
+def test_a_camera_does_not_come_and_go_with_vehicles_at_the_limit() -> None:
+    mounted = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03)
+    calibration, lines, told, now = SelfCalibration(mounted.size), _seen(0.0), [], 0.0
+    for wide in (3.0, 3.25, 3.6, 3.25, 3.0):  # a median within the limit, just over it, far over it, and back
+        for _ in range(SelfCalibration.WINDOW):
+            now += SelfCalibration.UNMOVED_INTERVAL
+            calibration.update(lines, now, _cars(mounted, (12.0, 0.0), wide=wide))
+        told.append(calibration.camera is not None)
+    assert told == [True, True, False, False, True]

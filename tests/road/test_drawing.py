@@ -7,13 +7,14 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import ImageFont
 
 from trilitenet.data.synthetic import Scene
 from trilitenet.errors import ConfigError, ShapeError
-from trilitenet.processing.drawing import draw_label
+from trilitenet.processing.drawing import draw_label, label_font
 from trilitenet.processing.geometry import Camera
 from trilitenet.road.camera import View
-from trilitenet.road.drawing import ROAD_PARTS, draw_road, from_above
+from trilitenet.road.drawing import ROAD_PARTS, _above_maps, draw_road, from_above
 from trilitenet.road.monitor import RoadMonitor
 from trilitenet.road.structures import EgoLane, Estimate, EventKind, LeadVehicle, Road
 from trilitenet.structures import Perception
@@ -100,12 +101,21 @@ def test_marks_across_the_road_are_in_their_rows_from_above() -> None:
     assert light.mean(axis=1) @ np.arange(200) / light.mean(axis=1).sum() == pytest.approx(159.5, abs=1.0)
 
 
-def test_nothing_is_seen_behind_the_camera() -> None:
-    camera = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.1)
+@pytest.mark.parametrize("yaw", [0.0, 0.3])
+def test_nothing_is_seen_behind_the_camera(yaw: float) -> None:
+    camera = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.1, yaw=yaw)
     sky = np.full((360, 640, 3), 255, np.uint8)
     picture = from_above(sky, camera, View(near=-20, far=20))
     assert (picture[:100] == 255).any()
     assert (picture[160:] < 50).all()
+
+
+def test_no_maps_are_made_for_a_camera_without_distortion() -> None:
+    made = _above_maps.cache_info().misses
+    for yaw in (0.011, 0.012, 0.3):  # a video that calibrates itself has another camera again and again
+        camera = Camera.from_field_of_view((360, 640), 60.0, 1.4, pitch=0.03, yaw=yaw)
+        from_above(np.zeros((360, 640, 3), np.uint8), camera, View(near=0.0, far=48.0, half_width=11.0))
+    assert _above_maps.cache_info().misses == made
 
 
 def test_from_above_refuses_other_sizes_and_empty_views() -> None:
@@ -160,6 +170,23 @@ def test_the_status_has_no_negative_zero_and_fits(labels: list[tuple[str, int]])
     wide = np.zeros((40, 2000, 3), np.uint8)
     draw_label(wide, text, (0, 30), (255, 0, 0), size=size)
     assert np.flatnonzero(wide.any(axis=(0, 2)))[-1] < 316
+
+
+def test_a_font_is_made_once_for_all_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[float] = []
+    load = ImageFont.load_default
+
+    def note(size: float) -> object:
+        made.append(size)
+        return load(size)
+
+    monkeypatch.setattr(ImageFont, "load_default", note)
+    label_font.cache_clear()
+    warnings: tuple[EventKind, ...] = ("forward_collision", "lane_departure_right")
+    for _ in range(2):
+        draw_road(np.zeros((180, 320, 3), np.uint8), Perception((180, 320)), Road(warnings=warnings))
+    assert made
+    assert len(made) == len(set(made))
 
 
 def test_a_photo_is_not_calibrating(labels: list[tuple[str, int]]) -> None:

@@ -400,6 +400,30 @@ def test_the_lead_is_the_nearest_in_the_lane_and_its_distance_that_of_its_rear()
         assert lead.distance.value == pytest.approx(15.0 - REAR_OVERHANG, abs=0.1)
 
 
+def test_what_is_behind_a_vehicle_too_near_to_be_measured_is_no_lead() -> None:
+    camera = dataclasses.replace(CAMERA, front=3.5)
+    fit = fit_ego_lane(line_at(1.8), line_at(-1.8), camera, CameraErrors())
+    assert fit is not None
+    for near, lead in (((4.4, 0.0), None), ((4.4, 3.6), 1), ((5.4, 0.0), 0)):  # at the bumper, beside it, before it
+        boxes = standing((near[0], near[1]), (12.0, 0.0))
+        distances = find_distances(boxes, camera, CameraErrors())
+        assert (distances[0] is None) == (near[0] == 4.4)
+        assert distances[1] is not None
+        found = find_lead(boxes, distances, fit, camera)
+        assert (None if found is None else found.box) == lead
+
+
+def test_what_is_behind_a_lorry_too_far_to_be_measured_is_no_lead() -> None:
+    fit = fit_ego_lane(line_at(1.8), line_at(-1.8), CAMERA, CameraErrors())
+    assert fit is not None
+    boxes = standing((134.0, 0.0), (136.0, 0.0))
+    boxes.xyxy[0] += np.array([-3, -35, 3, 0], np.float32)  # a large box's lower edge is less sure
+    distances = find_distances(boxes, CAMERA, CameraErrors())
+    assert distances[0] is None
+    assert distances[1] is not None
+    assert find_lead(boxes, distances, fit, CAMERA) is None
+
+
 def test_a_lorry_beside_that_the_edge_of_the_picture_cuts_is_no_lead() -> None:
     fit = fit_ego_lane(line_at(1.8), line_at(-1.8), CAMERA, CameraErrors())
     assert fit is not None

@@ -103,6 +103,8 @@ _LONGEST_HEADER: Final = 100_000_000
 
 _NAMING: Final = frozenset({"GLOBAL", "STACK_GLOBAL", "INST"})
 """Opcodes of a pickle that name a function or a class."""
+_PICKLES: Final = 5
+"""Pickles in a row in a checkpoint of the older format: magic number, version, system, state, keys of its storages."""
 
 _IN_ITS_PLACE: Final = {
     b"<": "a web page; download the file itself",
@@ -434,10 +436,14 @@ def _names_code(path: Path) -> bool:
     """Return whether a pickle names functions or classes, as that of a zipped checkpoint always does; none is run."""
     if zipfile.is_zipfile(path):
         return True
-    try:
-        return any(opcode.name in _NAMING for opcode, _, _ in pickletools.genops(path.read_bytes()))
-    except ValueError:  # no pickle, or cut before the first
-        return False
+    with path.open("rb") as file:
+        try:
+            for _ in range(_PICKLES):
+                if any(opcode.name in _NAMING for opcode, _, _ in pickletools.genops(file)):
+                    return True
+        except (ValueError, MemoryError, OverflowError):  # no pickle, its end, or a text longer than can be
+            pass
+    return False
 
 
 def _what_instead(path: Path, error: Exception | None = None) -> str:

@@ -30,6 +30,7 @@ __all__ = [
     "draw",
     "draw_boxes",
     "draw_label",
+    "label_font",
     "line_thickness",
 ]
 
@@ -216,7 +217,7 @@ def draw_label(
 
 
 def _plate(text: str, size: int, colour: Colour) -> NDArray[np.uint8]:
-    font = _font(size)
+    font = label_font(size)
     left, _, right, _ = font.getbbox(text, anchor="ls")
     above, below = font.getbbox("Ag", anchor="ls")[1::2]
     margin = max(2, size // 4)
@@ -232,6 +233,7 @@ _SHORT: Final = 32
 _kept_plate = functools.lru_cache(maxsize=512)(_plate)
 
 
-@functools.lru_cache(maxsize=16)
-def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+@functools.lru_cache(maxsize=64)
+def label_font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """Return the font of `draw_label`, with letters so many pixels high."""
     return ImageFont.load_default(size)

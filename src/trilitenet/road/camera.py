@@ -299,7 +299,8 @@ class SelfCalibration:
         low_width, high_width = self.VEHICLE_WIDTHS
         if len(self._vehicles) >= needed:
             wide = self.lane_width * float(np.median(self._vehicles)) / spread
-            if not low_width < wide < high_width:
+            slack = 1.0 if self.camera is None else 1.05  # so that it does not come and go
+            if not low_width / slack < wide < high_width * slack:
                 self.camera = None
                 return
         self.camera = dataclasses.replace(self._level, height=mounted, pitch=pitch, yaw=yaw)

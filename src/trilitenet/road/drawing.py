@@ -14,10 +14,9 @@ from typing import Final
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ImageFont
 
 from trilitenet.errors import ConfigError, ShapeError
-from trilitenet.processing.drawing import check_parts, draw_label
+from trilitenet.processing.drawing import check_parts, draw_label, label_font
 from trilitenet.processing.geometry import Camera
 from trilitenet.road.camera import View
 from trilitenet.road.structures import LaneLine, Road
@@ -114,12 +113,15 @@ def from_above(image: NDArray[np.uint8], camera: Camera, view: View | None = Non
     if min(height, width) < 1:
         raise ConfigError(f"a view needs far above near, and a half_width and scale above 0, got {view}")
     matrix = camera.ground_homography @ view.matrix
-    corners = np.array([[0, width - 1, 0, width - 1], [0, 0, height - 1, height - 1], [1, 1, 1, 1]])
-    if camera.distortion or (matrix[2] @ corners).min() <= 0:  # the matrix shows what lies behind the camera, mirrored
+    if camera.distortion:
         place, part = _above_maps(camera, view)
         return np.asarray(cv2.remap(image, place, part, cv2.INTER_LINEAR, borderValue=_PLATE), np.uint8)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpPerspective(image, matrix, (width, height), flags=flags, borderValue=_PLATE), np.uint8)
+    picture = np.asarray(cv2.warpPerspective(image, matrix, (width, height), flags=flags, borderValue=_PLATE), np.uint8)
+    depth = matrix[2, 0] * np.arange(width) + matrix[2, 1] * np.arange(height)[:, None] + matrix[2, 2]
+    if depth.min() <= 0:  # the matrix shows what lies behind the camera, mirrored
+        picture[depth <= 0] = _PLATE
+    return picture
 
 
 @functools.lru_cache(maxsize=8)
@@ -228,7 +230,7 @@ def _draw_status(canvas: NDArray[np.uint8], perception: Perception, road: Road, 
 def _fit(lines: list[str], room: int, size: int) -> tuple[int, list[int]]:
     """Return the height of letters, ``size`` or less, at which labels fit into ``room``, and their widths: pixels."""
     while True:
-        font = ImageFont.load_default(size)
+        font = label_font(size)
         widths = [math.ceil(font.getlength(text)) + 2 * max(2, size // 4) for text in lines]
         if max(widths) <= room or size <= _SMALLEST:
             return size, widths

@@ -387,14 +387,14 @@ def find_lead(boxes: Boxes, distances: Sequence[Estimate | None], fit: LaneFit, 
     """
     if fit.centre is None or not len(boxes):
         return None
-    width = camera.size[1]
+    height, width = camera.size
     left, _, right, bottom = boxes.xyxy.T.astype(np.float64) - 0.5
     ground, left_end, right_end = (
         camera.to_ground(np.stack([column, bottom], axis=1)) for column in ((left + right) / 2, left, right)
     )
-    best: LeadVehicle | None = None
-    for index, ((x, y), distance) in enumerate(zip(ground.tolist(), distances, strict=True)):
-        if distance is None or (best is not None and distance.value >= best.distance.value):
+    best, nearest = None, math.inf
+    for index, (x, y) in enumerate(ground.tolist()):
+        if not x < nearest or bottom[index] >= height - 1.5:
             continue
         middle = _lane_at(fit.centre, x)
         if left[index] < 1 or right[index] > width - 2:
@@ -403,9 +403,10 @@ def find_lead(boxes: Boxes, distances: Sequence[Estimate | None], fit: LaneFit, 
                 continue
         elif abs(y - middle) > IN_LANE * fit.half_width:
             continue
-        track = -1 if boxes.track_id is None else int(boxes.track_id[index])
-        best = LeadVehicle(index, track, distance)
-    return best
+        best, nearest = index, x
+    if best is None or (distance := distances[best]) is None:  # what is behind it is not the lead
+        return None
+    return LeadVehicle(best, -1 if boxes.track_id is None else int(boxes.track_id[best]), distance)
 
 
 def find_distances(boxes: Boxes, camera: Camera, errors: CameraErrors) -> tuple[Estimate | None, ...]:

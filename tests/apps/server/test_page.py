@@ -742,8 +742,18 @@ def test_pictures_are_sent_as_the_service_takes_them(browser: Page, tmp_path: Pa
         assert running.stop()
 
 
+def _open_bitmaps(page: Page) -> int:
+    return int(page.script("return window.bitmaps.filter((bitmap) => bitmap.width > 0).length"))
+
+
 def _refuse(page: Page, status: int, condition: str) -> None:
     """Let requests whose `pictures` meet a condition be refused; `window.sent` takes the number and bytes of all."""
+    page.script(
+        "window.bitmaps = []; const decode = window.createImageBitmap;"
+        "window.createImageBitmap = async (...of) => {"
+        "  const bitmap = await decode(...of); window.bitmaps.push(bitmap); return bitmap;"
+        "}"
+    )
     page.script(
         "const [status] = arguments; const real = window.fetch; window.sent = [];"
         "window.fetch = async (path, options) => {"
@@ -779,6 +789,7 @@ def test_a_photo_that_is_too_much_is_sent_smaller(page: Page, tmp_path: Path, st
     assert sizes[0] == path.stat().st_size
     assert sizes[-1] <= 150_000
     assert all(later <= earlier / 2 for earlier, later in itertools.pairwise(sizes))
+    assert _open_bitmaps(page) == 1, "that which is shown"
 
 
 def test_a_photo_that_is_always_too_much_is_given_up(page: Page, photo: Path) -> None:
@@ -786,6 +797,7 @@ def test_a_photo_that_is_always_too_much_is_given_up(page: Page, photo: Path) ->
     page.choose(photo)
     page.wait(lambda: page["error"].text == "Too much.")
     assert page["summary"].text == ""
+    assert _open_bitmaps(page) == 0
 
 
 def test_the_times_of_a_clip_say_what_they_are_of(page: Page, clip: Path) -> None:

@@ -255,15 +255,22 @@ def _parse(body: bytes, split: int, names: Sequence[str], settings: Settings) ->
     return _Query(identifier, images, size, outputs, confidence)
 
 
+def _parameters(mapping: dict[str, Any], owner: str) -> dict[str, Any]:
+    parameters = mapping.get("parameters")
+    if parameters is None:
+        return {}
+    if not isinstance(parameters, dict):
+        raise _bad(f"the parameters of {owner} must be an object")
+    return parameters
+
+
 def _confidence(mapping: dict[str, Any]) -> float | None:
     """Return the parameter ``confidence`` of a request.
 
     Raises:
         ProblemError: 400 if it is no number from 0 to 1, or there is a parameter that means nothing here.
     """
-    parameters = mapping.get("parameters") or {}
-    if not isinstance(parameters, dict):
-        raise _bad("the parameters of a request must be an object")
+    parameters = _parameters(mapping, "a request")
     for name in parameters:
         if name not in (*_PARAMETERS, *_PASSED_OVER):
             name = name[:40]
@@ -289,9 +296,7 @@ def _wanted(mapping: dict[str, Any], names: Sequence[str]) -> dict[str, bool]:
         name = output.get("name")
         if name not in names:
             raise _bad(f"unknown output {str(name)[:40]!r}; there are {', '.join(names)}")
-        parameters = output.get("parameters") or {}
-        if not isinstance(parameters, dict):
-            raise _bad("the parameters of an output must be an object")
+        parameters = _parameters(output, "an output")
         if "classification" in parameters:
             raise _bad("the classification extension is not supported")
         wanted[name] = _flag(output, "binary_data", binary)

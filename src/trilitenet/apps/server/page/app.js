@@ -234,6 +234,7 @@ async function predictPhoto(file, signal) {
     try {
       return { blob, picture, result: await predict(blob, floor, signal) };
     } catch (error) {
+      picture?.close();
       if (!isTooMuch(error) || !picture || blob.size <= LEAST_PHOTO) throw error;
       most = blob.size / 2;
       element("summary").textContent = "Too much at once: sending a smaller picture …";

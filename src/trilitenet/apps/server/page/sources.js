@@ -22,7 +22,11 @@ export async function openPhoto(file, limits) {
   const within = { ...limits, max_body: Math.min(LARGEST_UPLOAD, limits.max_body) };
   const fits = scaleTo(width, height, LONGEST.photo, within) === 1 && file.size <= within.max_body;
   if (SENT_AS_IS.includes(file.type) && !(await mayBeTurned(file)) && fits) return { blob: file, picture };
-  return shrink(picture, width, height, LONGEST.photo, 0.92, within);
+  try {
+    return await shrink(picture, width, height, LONGEST.photo, 0.92, within);
+  } finally {
+    picture.close();
+  }
 }
 
 /** By how much a picture must be made smaller, 1 if not at all. */
