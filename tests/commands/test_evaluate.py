@@ -280,13 +280,26 @@ def test_boxes_of_names_that_the_split_lacks_are_told(
 
 
 def test_predictions_that_were_cut_off_are_told(data: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    for score_of, told in ((0.2504, False), (0.41, True)):
+    undefined = ", so precision, recall and F1 at {} are undefined"
+    own = " (give the model's own --confidence)"
+    for score_of, protocol, confidence, told in (
+        (0.2504, "fair", 0.25, None),
+        (0.41, "fair", 0.25, undefined.format("0.25") + own),
+        (0.41, "both", 0.3, undefined.format("0.25 and 0.3") + own),
+        (0.41, "fair", 0.4, undefined.format("0.25")),
+        (0.2, "fair", 0.1, undefined.format("0.1") + own),
+        (0.2, "paper", 0.1, None),
+        (1.0, "paper", 0.25, ""),  # nothing is stated at a confidence
+    ):
         entry = {"category_id": 1, "bbox": [0, 0, 2, 2], "score": score_of}
         entries = [entry | {"image_id": name} for name in DrivingDataset(data, "val").names]
         (tmp_path / "detections.json").write_text(json.dumps(entries))
-        score(tmp_path, data=data, resamples=0, worst=0)
-        message = "no box is below confidence 0.41, so precision, recall and F1 at 0.25 are undefined"
-        assert (message in caplog.text) == told
+        caplog.clear()
+        options: dict[str, Any] = {"protocol": protocol, "confidence": confidence}
+        score(tmp_path, data=data, resamples=0, worst=0, **options)
+        start = f"detections.json: no box is below confidence {score_of:.2g}"
+        end = "; if others were cut off, average precision lacks them too"
+        assert caplog.messages == ([] if told is None else [start + told + end])
 
 
 def test_thresholds_that_decide_nothing_are_told(data: Path, weights: Path, caplog: pytest.LogCaptureFixture) -> None:

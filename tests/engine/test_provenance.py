@@ -9,7 +9,7 @@ import pytest
 from tests.engine.labelled import Images, fake_predictor
 from trilitenet.engine import provenance
 from trilitenet.engine.evaluate import evaluate
-from trilitenet.engine.provenance import describe_hardware
+from trilitenet.engine.provenance import describe_hardware, gpu_index
 
 
 @pytest.fixture(autouse=True)
@@ -48,6 +48,11 @@ def test_the_gpu_of_another_runtime_is_told_by_the_driver(driver: Path, monkeypa
     add_gpu(driver, "0000:03:00.0", "NVIDIA H200")  # CUDA has an order of its own
     assert describe_hardware("onnxruntime cuda fp32") == f"{plain}, Tesla T4 or NVIDIA H200"
     assert describe_hardware("onnxruntime cpu fp32") == plain
+
+
+def test_the_index_of_a_gpu() -> None:
+    runtimes = ("torch cuda", "torch cuda:1 graph", "tensorrt cuda fp16", "torch program cuda:12", "openvino cpu fp32")
+    assert [gpu_index(runtime) for runtime in runtimes] == [0, 1, 0, 12, None]
 
 
 def test_a_report_tells_the_gpu_of_its_runtime(driver: Path) -> None:

@@ -182,11 +182,22 @@ def test_the_figures_at_every_stated_confidence_by_hand() -> None:
 
 
 def test_what_boxes_that_were_cut_off_decide_is_undefined(rng: np.random.Generator) -> None:
-    for lowest, known in ((0.0, True), (0.255, True), (0.4, False)):
-        metric = fill(DetectionMetric(lowest=lowest), random_images(rng, 10, 1))
+    stated, common = (frozenset(f"{name}{suffix}" for name in ("precision", "recall", "f1")) for suffix in ("", "_025"))
+    for confidence, lowest, expected in (
+        (0.25, 0.0, frozenset()),
+        (0.25, 0.255, frozenset()),
+        (0.25, 0.4, stated | common),
+        (0.4, 0.405, common),
+        (0.1, 0.2, stated),
+    ):
+        metric = fill(DetectionMetric(confidence=confidence, lowest=lowest), random_images(rng, 10, 1))
         for one in (metric, DetectionMetric.from_state(json.loads(json.dumps(metric.state())))):
-            undefined = {name for name, value in one.figures().items() if np.isnan(value).any()}
-            assert undefined == (set() if known else {"precision_025", "recall_025", "f1_025"})
+            figures = one.figures(np.ones((2, 10)))
+            assert {name for name, value in figures.items() if np.isnan(value).any()} == expected
+            at = one.compute().at
+            assert at.confidence == confidence
+            for name in ("precision", "recall", "f1"):
+                assert getattr(at, name) == pytest.approx(figures[name][0], nan_ok=True)
 
 
 def test_an_ignored_region_is_neither_object_nor_background() -> None:

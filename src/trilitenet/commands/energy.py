@@ -14,6 +14,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final, TypeAlias
 
+from trilitenet.engine.provenance import gpu_index
+
 __all__ = ["Meter", "energy_meters", "gpu_meter"]
 
 Meter: TypeAlias = Callable[[], float | None]
@@ -46,8 +48,8 @@ def energy_meters(backends: Sequence[str]) -> Iterator[list[Meter]]:
 
 
 def _own_meter(backend: str) -> Meter | None:
-    on_gpu = re.search(r"cuda:?(\d*)", backend)
-    return _package() if on_gpu is None else gpu_meter(int(on_gpu[1] or 0))
+    index = gpu_index(backend)
+    return _package() if index is None else gpu_meter(index)
 
 
 def _package() -> Meter | None:

@@ -17,7 +17,7 @@ from trilitenet.engine.provenance import hash_files
 from trilitenet.engine.report import Report
 from trilitenet.engine.scorecard import CONDITIONS, GROUP
 from trilitenet.errors import ConfigError, DataError
-from trilitenet.metrics.detection import COMMON_CONFIDENCE, COMMON_CUT
+from trilitenet.metrics.detection import COMMON_CONFIDENCE, is_cut_off
 
 __all__ = ["score"]
 
@@ -85,11 +85,7 @@ def score(
     warn_of_unlabelled(dataset, saved.tasks)
     if "detection" in saved.tasks:
         _warn_of_names(saved.names, dataset.names, limit)
-        if saved.lowest > COMMON_CUT:
-            _LOGGER.warning(
-                "%s: no box is below confidence %.2g, so precision, recall and F1 at %g are undefined; boxes that were "
-                "cut off are missing in average precision too", DETECTIONS_FILE, saved.lowest, COMMON_CONFIDENCE,
-            )  # fmt: skip
+        _warn_of_cut(saved.lowest, None if protocol == "paper" else confidence)
     with show_progress("images") as shown:
         if "detection" in saved.tasks:
             dataset.warn_of_foreign(shown)
@@ -122,6 +118,28 @@ def score(
         )
     write_report(report, output)
     return report
+
+
+def _warn_of_cut(lowest: float, confidence: float | None) -> None:
+    """Warn where boxes may have been cut off, and say at which of the stated confidences nothing is known then.
+
+    Args:
+        lowest: The least confidence of all boxes.
+        confidence: That precision, recall and F1 are asked for at; None where they are not, nor at the common one.
+    """
+    stated = {COMMON_CONFIDENCE} if confidence is None else {COMMON_CONFIDENCE, confidence}
+    cut = sorted(one for one in stated if is_cut_off(lowest, one))
+    if not cut:
+        return
+    undefined = ""
+    if confidence is not None:
+        undefined = f", so precision, recall and F1 at {' and '.join(f'{one:g}' for one in cut)} are undefined"
+    if confidence in cut:
+        undefined += " (give the model's own --confidence)"
+    _LOGGER.warning(
+        "%s: no box is below confidence %.2g%s; if others were cut off, average precision lacks them too",
+        DETECTIONS_FILE, lowest, undefined,
+    )  # fmt: skip
 
 
 def _warn_of_names(predicted: Set[str], names: Sequence[str], limit: int | None) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 import trilitenet
 from trilitenet.processing.cores import processor, usable_cores
 
-__all__ = ["describe_hardware", "describe_versions", "hash_files", "peak_memory"]
+__all__ = ["describe_hardware", "describe_versions", "gpu_index", "hash_files", "peak_memory"]
 
 _RUNTIMES: Final = ("torch", "onnxruntime", "openvino", "ncnn", "executorch", "tensorrt")
 _NVIDIA: Final = Path("/proc/driver/nvidia/gpus")
@@ -56,9 +56,19 @@ def describe_hardware(runtime: str) -> str:
     Args:
         runtime: The runtime and its device, such as ``"torch cuda:1"``.
     """
-    on_gpu = re.search(r"cuda:?(\d*)", runtime)
-    gpu = None if on_gpu is None else _gpu(int(on_gpu[1] or 0))
+    index = gpu_index(runtime)
+    gpu = None if index is None else _gpu(index)
     return f"{processor()[0]}, {usable_cores()} cores, {platform.system()}" + (f", {gpu}" if gpu else "")
+
+
+def gpu_index(runtime: str) -> int | None:
+    """Return which GPU a runtime is on, as CUDA counts them; None if on none.
+
+    Args:
+        runtime: The runtime and its device, such as ``"torch cuda:1"``.
+    """
+    found = re.search(r"cuda:?(\d*)", runtime)
+    return None if found is None else int(found[1] or 0)
 
 
 def _gpu(index: int) -> str | None:

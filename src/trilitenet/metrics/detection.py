@@ -30,7 +30,6 @@ from trilitenet.metrics.rows import Rows, pack_tables, unpack_tables
 __all__ = [
     "AREAS",
     "COMMON_CONFIDENCE",
-    "COMMON_CUT",
     "IOU_THRESHOLDS",
     "DetectionCurve",
     "DetectionMetric",
@@ -39,6 +38,7 @@ __all__ = [
     "check_image",
     "confidence_histogram",
     "in_regions",
+    "is_cut_off",
     "match_boxes",
     "precision_recall_curve",
 ]
@@ -56,8 +56,8 @@ AREAS: Final[dict[str, tuple[float, float]]] = {
 """Box areas, in square pixels of the image as stored, both ends included (COCO's)."""
 COMMON_CONFIDENCE: Final = 0.25
 """Precision, recall and F1 are given here too, whatever a model's own confidence."""
-COMMON_CUT: Final = 0.26
-"""Boxes that end above this confidence were cut off above the common one; those cut off there end a little above it."""
+_CUT_SLACK: Final = 0.01
+"""Boxes that were cut off at a confidence end a little above it."""
 _RECALLS: Final[FloatArray] = np.linspace(0.0, 1.0, 101)
 _ALL_BITS: Final = (1 << len(IOU_THRESHOLDS)) - 1
 _EPS: Final = float(np.spacing(1))
@@ -113,7 +113,7 @@ class DetectionScores:
         ap_large: AP50:95 of boxes from 96 x 96 pixels.
         ap50_by_class: Class name -> AP50.
         best: Where F1 is best.
-        at: At the stated confidence.
+        at: At the stated confidence; NaN too where boxes above it may have been cut off.
         recall_all: Recall at IoU 0.5 of all boxes, whatever their confidence.
     """
 
@@ -169,7 +169,7 @@ class DetectionMetric:
         class_names: Names that class ids index.
         confidence: The stated confidence of `DetectionScores.at` and of the confusion matrix.
         max_boxes: At most so many boxes an image and class count (COCO itself uses 100).
-        lowest: Boxes below this confidence may have been cut off; what they decide is undefined.
+        lowest: Boxes below this confidence may have been cut off; figures at one below it are undefined.
     """
 
     def __init__(
@@ -391,35 +391,36 @@ class DetectionMetric:
         """Return where F1 is best over all images, each counted once; found once for all weightings."""
         if self._best is None:
             objects = self._objects.array[:, :: len(AREAS)].any()
-            self._best = _best_point(self.curve()) if objects else OperatingPoint(*[float("nan")] * 4)
+            self._best = _point_of_best_f1(self.curve()) if objects else OperatingPoint(*[float("nan")] * 4)
         return self._best
 
     def _point_figures(
         self, weights: NDArray[Any] | None, confidence: float, suffix: str = ""
     ) -> dict[str, FloatArray]:
-        """Precision, recall and F1 above a confidence at IoU 0.5, from sums an image."""
+        """Precision, recall and F1 above a confidence at IoU 0.5, NaN where boxes above it may have been cut off."""
+        figures = self._figures_above(weights, confidence)
+        undefined = is_cut_off(self.lowest, confidence)
+        return {
+            f"{name}{suffix}": np.full_like(value, np.nan) if undefined else value for name, value in figures.items()
+        }
+
+    def _figures_above(self, weights: NDArray[Any] | None, confidence: float) -> dict[str, FloatArray]:
+        """Precision, recall and F1 of the boxes above a confidence at IoU 0.5, from sums an image."""
         above = self._scores.array[:, 0] > confidence
         image = self._image.array[:, 0]
         boxes = [np.bincount(image[which & above], minlength=len(self)) for which in self._verdicts()]
         table = np.stack([*boxes, self._objects.array[:, :: len(AREAS)].sum(axis=1)], axis=1)
         right, bad, objects = weighted_sum(table, weights).T
         return {
-            f"precision{suffix}": ratio(right, right + bad),
-            f"recall{suffix}": ratio(right, objects),
-            f"f1{suffix}": ratio(2 * right, right + bad + objects),
+            "precision": ratio(right, right + bad),
+            "recall": ratio(right, objects),
+            "f1": ratio(2 * right, right + bad + objects),
         }
 
     def _best_figures(self, weights: NDArray[Any] | None) -> dict[str, FloatArray]:
         """Precision, recall and F1 at the confidence that is best over all images, whatever the weighting."""
         below = np.nextafter(np.float32(self._best_point().confidence), np.float32(-1))
-        return self._point_figures(weights, float(below), "_best")
-
-    def _common_figures(self, weights: NDArray[Any] | None) -> dict[str, FloatArray]:
-        """Precision, recall and F1 at the common confidence, NaN where boxes above it may have been cut off."""
-        figures = self._point_figures(weights, COMMON_CONFIDENCE, "_025")
-        if self.lowest > COMMON_CUT:
-            return {name: np.full_like(value, np.nan) for name, value in figures.items()}
-        return figures
+        return {f"{name}_best": value for name, value in self._figures_above(weights, float(below)).items()}
 
     def _size_figures(self, weights: NDArray[Any] | None) -> dict[str, FloatArray]:
         """AP50:95 of small, medium and large boxes."""
@@ -442,7 +443,7 @@ class DetectionMetric:
             **self._size_figures(weights),
             **self._point_figures(weights, self.confidence),
             **self._best_figures(weights),
-            **self._common_figures(weights),
+            **self._point_figures(weights, COMMON_CONFIDENCE, "_025"),
         }
 
     def compute(self) -> DetectionScores:
@@ -533,6 +534,11 @@ def confidence_histogram(
     return np.histogram(scores[right], edges)[0], np.histogram(scores[wrong], edges)[0]
 
 
+def is_cut_off(lowest: float, confidence: float) -> bool:
+    """Return whether boxes above a confidence may have been cut off, for the lowest of all ends above it."""
+    return lowest > confidence + _CUT_SLACK
+
+
 def match_boxes(
     boxes: NDArray[Any], class_id: NDArray[Any], truth: NDArray[Any], truth_class: NDArray[Any]
 ) -> NDArray[np.intp]:
@@ -593,7 +599,7 @@ def _ap(sums: RankedSums, hit: NDArray[np.bool_], counted: NDArray[np.bool_], ob
     return np.asarray(points.mean(axis=1))
 
 
-def _best_point(curve: DetectionCurve) -> OperatingPoint:
+def _point_of_best_f1(curve: DetectionCurve) -> OperatingPoint:
     if not len(curve.confidence):  # nothing is found, at any confidence
         return OperatingPoint(float("nan"), float("nan"), 0.0, 0.0)
     f1 = np.nan_to_num(ratio(2 * curve.precision * curve.recall, curve.precision + curve.recall))
