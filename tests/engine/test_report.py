@@ -307,7 +307,8 @@ def test_of_the_published_protocol_alone_plots_pixels_and_counts_are_its_own(tmp
     assert not compare_reports({"a": alone, "b": alone}, resamples=0).confidence
 
 
-def test_each_protocol_is_told_with_what_it_decided_by(report: Report) -> None:
+def test_each_protocol_is_told_with_what_it_decided_by(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "160")  # no line is broken
     assert report.thresholds() == {
         "fair": "confidence 0.3, iou 0.6, max_boxes 300, drivable 0.5, lane 0.5",
         "paper": "confidence 0.001, iou 0.6, max_boxes 300, drivable 0.5, lane 0.5",
