@@ -32,6 +32,7 @@ DRIVABLE, LANE = 0.95, 0.6
 
 
 def learn(samples: list[Sample], steps: int, rate: float, seed: int) -> TriLiteNet:
+    """Return tiny trained on the frames as `tests/engine/test_overfit.py` does, telling how far it is."""
     torch.manual_seed(seed)
     torch.set_flush_denormal(True)
     network = build_network("tiny").train()
