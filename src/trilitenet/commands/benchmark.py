@@ -11,7 +11,6 @@ import math
 import os
 import platform
 import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -30,7 +29,7 @@ from trilitenet.commands.tables import markdown_row
 from trilitenet.config import TASKS, VARIANTS, check_size
 from trilitenet.data.synthetic_drive import SyntheticDrive
 from trilitenet.engine.provenance import describe_hardware, peak_memory
-from trilitenet.errors import ConfigError, InputError, import_extra, write_file
+from trilitenet.errors import ConfigError, InputError, import_extra, scratch_folder, write_file
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, FrameReader, find_sources
 from trilitenet.inference.video import VideoWriter
@@ -304,8 +303,7 @@ def benchmark(
             pairs = _fitting(names or ["tiny"], backend)
             film = None
             if stage == "video":
-                scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="trilitenet-"))
-                film = _Film(video, source, Path(scratch))
+                film = _Film(video, source, stack.enter_context(scratch_folder()))
             for name, one in pairs:
                 entry = _Entry(name, one, device, streams, threads, own_builder(name, network))
                 stack.enter_context(entry.predictor)

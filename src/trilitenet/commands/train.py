@@ -42,7 +42,7 @@ from trilitenet.data.description import folder_name
 from trilitenet.data.identity import identify, parts_of
 from trilitenet.data.loader import build_loader
 from trilitenet.data.prepared import PreparedDataset, default_cache, is_prepared, open_dataset
-from trilitenet.data.reading import DrivingDataset, MixedDataset, SampleSource, as_address, sampling_weights
+from trilitenet.data.reading import DrivingDataset, MixedDataset, SampleSource, sampling_weights
 from trilitenet.data.transforms import TrainTransform, Transform
 from trilitenet.engine.anchors import box_sizes, fit_anchors
 from trilitenet.engine.evaluate import evaluate
@@ -65,6 +65,7 @@ from trilitenet.models.builders import build_by
 from trilitenet.models.detection import DetectionHead
 from trilitenet.models.trilitenet import TriLiteNet, foreign_layers
 from trilitenet.models.weights import load_network, read_card
+from trilitenet.processing.addresses import as_address
 
 __all__ = ["build_loss", "train", "training_data", "validation_figures"]
 

@@ -47,7 +47,6 @@ from trilitenet.data.reading import (
     PREPARED_FILE,
     DrivingDataset,
     SampleSource,
-    as_address,
     check_root,
     decode_image,
     is_image_file,
@@ -66,6 +65,7 @@ from trilitenet.errors import (
     replacing,
     writing,
 )
+from trilitenet.processing.addresses import as_address
 from trilitenet.processing.cores import ProcessPool
 
 try:

@@ -18,7 +18,6 @@ import functools
 import hashlib
 import logging
 import math
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -31,6 +30,7 @@ from trilitenet.config import Task, parse_json
 from trilitenet.data.description import DatasetDescription, MaskMeaning, class_table, read_description
 from trilitenet.data.sample import Sample
 from trilitenet.errors import DataError, brief, did_you_mean, few
+from trilitenet.processing.addresses import as_address
 
 __all__ = [
     "FOLDERS",
@@ -41,7 +41,6 @@ __all__ = [
     "DrivingDataset",
     "MixedDataset",
     "SampleSource",
-    "as_address",
     "check_root",
     "decode",
     "decode_grey",
@@ -71,8 +70,6 @@ FOLDERS: Final = (IMAGE_FOLDER, *(folder for folder, _ in LABEL_FILES.values()))
 IMAGE_ENDINGS: Final = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
 
 _IGNORED: Final = 2
-_SINGLE_SLASH: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/(?!/)(.+)")
-"""An address as a path of it reads; not ``C:/``, which has one letter."""
 
 _READ_RGB: Final[int | None] = getattr(cv2, "IMREAD_COLOR_RGB", None)
 """Decode to RGB at once, which OpenCV can from 4.11 on."""
@@ -96,18 +93,6 @@ class SampleSource(Protocol):
 def is_image_file(name: str) -> bool:
     """Return whether a file's name is one of an image; hidden ones, such as ``._0001.jpg`` of macOS, are none."""
     return not name.startswith(".") and name.lower().endswith(IMAGE_ENDINGS)
-
-
-def as_address(root: str | Path) -> str | None:
-    """Return the address (``https://...``) that a text is, or a path of it, which lost a slash; None of a folder."""
-    text = str(root)
-    if "://" in text:
-        return text
-    found = _SINGLE_SLASH.fullmatch(text)
-    if found is None or Path(text).exists():
-        return None
-    scheme, rest = found.groups()
-    return f"{scheme}:{'///' if scheme.lower() == 'file' else '//'}{rest}"
 
 
 def check_root(root: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import re
 import struct
 import warnings
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from trilitenet.errors import InputError, ShapeError
+from trilitenet.processing.addresses import as_address
 
 __all__ = ["BROKEN", "no_image", "open_image", "read_image", "to_rgb", "upright_size"]
 
@@ -70,8 +70,8 @@ def read_image(image: str | Path | bytes | Image.Image | NDArray[Any]) -> NDArra
         try:
             data = Path(image).read_bytes()
         except (FileNotFoundError, ValueError) as error:  # ValueError: a zero byte in it
-            if re.match(r"[a-z][a-z0-9+.-]+:[/\\]", name, re.IGNORECASE):  # of two slashes a Path keeps one
-                raise InputError(f"{name}: is a URL; download it first, or use `trilitenet predict`") from error
+            if address := as_address(name):
+                raise InputError(f"{address}: is a URL; download it first, or use `trilitenet predict`") from error
             raise InputError(f"{name}: no such file") from error
         except OSError as error:
             raise InputError(f"{name}: cannot be read ({error.strerror or error})") from error

@@ -461,6 +461,11 @@ def test_images_in_folders_below_that_of_their_split_are_found(tmp_path: Path, m
     assert {split: source.names(split) for split in source.splits} == {"train": ["a1", "a2"], "val": ["b1"]}
     assert source.record("train", "a1").objects
     own = source.record("train", "a1").image
+    twin = own.with_suffix(".jpeg")
+    twin.write_bytes(own.read_bytes() + b" ")
+    with pytest.raises(DataError, match="two images are called 'a1'"):
+        read_bdd100k(tmp_path)
+    twin.unlink()
     other = folder / "other"
     other.mkdir()
     cv2.imwrite(str(other / "a1.jpg"), np.zeros((9, 9, 3), np.uint8))

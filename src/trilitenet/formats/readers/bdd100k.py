@@ -502,8 +502,8 @@ def _images(folders: dict[str, Path], split: str) -> dict[str, Path]:
                 for path in visible(folder.iterdir()):
                     if path.suffix.lower() in IMAGE_ENDINGS[:2]:
                         first = images.setdefault(path.stem, path)
-                        copy = first.parent in path.parents or first.stat().st_size == path.stat().st_size
-                        if first != path and not copy:
+                        above = first.parent in path.parent.parents
+                        if not above and first.stat().st_size != path.stat().st_size:  # else it is a copy
                             raise same_name(path.stem, split, first, path)
         if images:
             return images
