@@ -22,7 +22,7 @@ from tests.models.conftest import published_state
 from trilitenet.apps.cli import main
 from trilitenet.commands.evaluate import evaluate
 from trilitenet.commands.synthesize import synthesize
-from trilitenet.commands.weights import finish, import_weights, info
+from trilitenet.commands.weights import average, finish, import_weights, info
 from trilitenet.config import shipped_weights
 from trilitenet.errors import ConfigError, DataError, OutputError, WeightsError
 from trilitenet.models.trilitenet import build_network
@@ -247,3 +247,38 @@ def test_the_figures_are_those_of_the_file_which_is_fp16_unless_asked_otherwise(
             assert card.metrics[f"test images, {name}"] == condition.images
             miou = card.metrics[f"test fair/drivable/miou, {name}"]
             assert miou == pytest.approx(condition.figures["fair/drivable/miou"], abs=1e-4)
+
+
+def test_the_mean_of_two_lies_between_them_and_has_no_figures(tmp_path: Path) -> None:
+    before = load_network("tiny")
+    torch.manual_seed(1)
+    after = build_network("tiny", anchors=before.card.anchors)
+    save_network(after, tmp_path / "after.safetensors", dataclasses.replace(before.card, provenance={"seed": "1"}))
+    card = average("tiny", tmp_path / "after.safetensors", tmp_path / "mean.safetensors", share=0.25)
+    assert card == read_card(tmp_path / "mean.safetensors")
+    assert card.metrics == {}
+    assert card.provenance == {"seed": "1", "mean of": "0.75 of tiny.safetensors, 0.25 of after.safetensors"}
+    old, new = before.state_dict(), load_network(tmp_path / "after.safetensors").state_dict()
+    for name, value in load_network(tmp_path / "mean.safetensors").state_dict().items():
+        torch.testing.assert_close(value, 0.75 * old[name] + 0.25 * new[name] if value.is_floating_point() else value)
+    for share, same in ((0, old), (1, new)):
+        average("tiny", tmp_path / "after.safetensors", tmp_path / "mean.safetensors", share=share, overwrite=True)
+        mean = load_network(tmp_path / "mean.safetensors").state_dict()
+        assert all(torch.equal(mean[name], value) for name, value in same.items() if value.is_floating_point())
+
+
+def test_what_has_no_mean_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "mean.safetensors"
+    for words, message in (
+        (["tiny", "small"], "no mean of two networks that differ in variant: tiny and small"),
+        (["tiny", "tiny", "--share", "1.5"], "share must be 0 to 1, got 1.5"),
+        (["tiny", "tiny", "--share", "nan"], "share must be 0 to 1, got nan"),
+    ):
+        assert main(["weights", "average", *words[:2], str(out), *words[2:]]) == 1
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+    assert not out.exists()
+    average("tiny", "tiny", out)
+    with pytest.raises(OutputError, match="exists already"):
+        average("tiny", "tiny", out)

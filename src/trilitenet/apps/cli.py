@@ -82,6 +82,7 @@ COMMANDS: Final[tuple[Command, ...]] = (
     Command("serve", "command", "serve", package="apps.server"),
     Command("train", "train", "train"),
     Command("train-table", "train_table", "train_table"),
+    Command("weights average", "weights", "average"),
     Command("weights finish", "weights", "finish"),
     Command("weights import", "weights", "import_weights"),
     Command("weights info", "weights", "info"),
@@ -89,7 +90,7 @@ COMMANDS: Final[tuple[Command, ...]] = (
 
 GROUPS: Final = {
     "data": "Make, read, check and convert data sets.",
-    "weights": "Import published weights, finish trained ones, and see what a file says of itself.",
+    "weights": "Import published weights, average and finish trained ones, and see what a file says of itself.",
 }
 """Words that gather commands, with their help."""
 

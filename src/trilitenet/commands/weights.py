@@ -1,4 +1,4 @@
-"""Weight files: convert published checkpoints, finish trained weights for use, and see what a file says of itself."""
+"""Weight files: convert published checkpoints, average and finish trained weights, see what a file says of itself."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ from trilitenet.engine.evaluate import evaluate as run_evaluation
 from trilitenet.engine.figures import CONDITION_FIGURES
 from trilitenet.engine.report import Report
 from trilitenet.errors import ConfigError, DataError, OutputError, scratch_folder
+from trilitenet.models.averaging import average_networks
 from trilitenet.models.weights import import_published, load_network, read_card, resolve_weights, save_network
 
-__all__ = ["CardText", "finish", "import_weights", "info"]
+__all__ = ["CardText", "average", "finish", "import_weights", "info"]
 
 _LOGGER: Final = logging.getLogger(__name__)
 _LOW: Final = ", 95% from"
@@ -74,6 +75,50 @@ def import_weights(
         raise OutputError(f"{destination}: is the checkpoint itself, which would be lost; give another name")
     card = import_published(source, destination, variant)
     sys.stdout.write(f"{destination}: {card.variant}, {card.classes} class(es), from {source.name}\n")
+    return card
+
+
+def average(
+    first: NameOrPath,
+    second: NameOrPath,
+    destination: StrPath,
+    /,
+    *,
+    share: float = 0.5,
+    network: str | None = None,
+    overwrite: bool = False,
+) -> ModelCard:
+    """Write the mean of weights before and after a fine-tuning, which often keeps most of what either does better.
+
+    Both must be of one network. The mean has the card of the second without its figures, and thresholds that are not
+    fixed for it: `weights finish` measures and fixes both.
+
+    Args:
+        first: Weights before, for example tiny.
+        second: Weights after, for example runs/mine/final.safetensors.
+        destination: The .safetensors file to write.
+        share: Of the second, 0 to 1.
+        network: The function that built a weight file's network, where it is one of your own: FILE.py:FUNCTION or
+            MODULE:FUNCTION.
+        overwrite: Replace an existing destination.
+
+    Returns:
+        The card written into the file.
+
+    Raises:
+        ConfigError: If the destination does not end with .safetensors, or the share is not within 0 and 1.
+        WeightsError: If a file is no such weights, or the two are of different networks.
+        OutputError: If the destination exists already, or cannot be written.
+    """
+    destination = Path(destination)
+    _check_destination(destination, overwrite=overwrite)
+    check_writable(destination)
+    mean = average_networks(load_network(first, network), load_network(second, network), share)
+    names = [Path(resolve_weights(each)).name for each in (first, second)]
+    provenance = {"mean of": f"{1 - share:g} of {names[0]}, {share:g} of {names[1]}"}
+    card = dataclasses.replace(mean.card, metrics={}, provenance=mean.card.provenance | provenance)
+    save_network(mean, destination, card)
+    sys.stdout.write(f"{destination}: {provenance['mean of']}\n")
     return card
 
 
