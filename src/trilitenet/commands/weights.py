@@ -114,7 +114,7 @@ def average(
     _check_destination(destination, overwrite=overwrite)
     check_writable(destination)
     mean = average_networks(load_network(first, network), load_network(second, network), share)
-    names = [Path(resolve_weights(each)).name for each in (first, second)]
+    names = [resolve_weights(each).name for each in (first, second)]
     provenance = {"mean of": f"{1 - share:g} of {names[0]}, {share:g} of {names[1]}"}
     card = dataclasses.replace(mean.card, metrics={}, provenance=mean.card.provenance | provenance)
     save_network(mean, destination, card)

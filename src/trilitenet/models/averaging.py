@@ -43,5 +43,5 @@ def average_networks(first: TriLiteNet, second: TriLiteNet, share: float) -> Tri
     with torch.no_grad():
         for key, value in new.items():
             if value.is_floating_point():
-                value.copy_((1 - share) * old[key].double() + share * value.double())
+                value.lerp_(old[key], 1 - share)
     return second
