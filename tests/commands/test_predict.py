@@ -930,7 +930,46 @@ def test_what_is_asked_of_the_model_reaches_it(folder: Path, tmp_path: Path, mon
 
     monkeypatch.setattr("trilitenet.commands.predict.load", load)
     asked = {"model": "m.onnx", "device": "cpu", "backend": "openvino", "confidence": 0.4, "long_side": 320}
+    asked["ego_mask"] = "bonnet.png"
     words = [word for name, value in asked.items() for word in (f"--{name.replace('_', '-')}", str(value))]
     output = str(tmp_path / "out")
     assert cli.main(["predict", str(folder / "alpha.png"), *words, "--batch-size", "2", "--output", output]) == 0
-    assert given == {**asked, "network": None, "batch_size": 2}
+    assert given == {**asked, "ego_mask": Path("bonnet.png"), "network": None, "batch_size": 2}
+
+
+def test_nothing_is_found_where_an_ego_mask_shows_the_own_car(
+    folder: Path, tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = np.zeros((360, 640), np.uint8)
+    own[250:] = 255
+    Image.fromarray(own).save(tmp_path / "bonnet.png")
+    drive(folder / "drive.mp4")
+    Image.fromarray(coloured_scene(640, 360)).save(folder / "upright.png")
+    output = tmp_path / "out"
+    words = ["predict", *(str(folder / name) for name in ("alpha.png", "upright.png", "drive.mp4")), "--no-overlay"]
+    words += ["--model", str(weights), "--ego-mask", str(tmp_path / "bonnet.png"), "--output", str(output), "--quiet"]
+    assert cli.main([*words, "--max-frames", "2"]) == 1
+    written = capsys.readouterr().err
+    assert "upright.png: the ego mask is of 640x360 pixels, the picture of 360x640, which is another shape" in written
+    frames = [json.loads((output / "alpha.json").read_text())]
+    frames += json.loads((output / "drive.json").read_text())["frames"]
+    assert len(frames) == 3
+    for frame in frames:
+        perception = Perception.from_dict(frame)
+        assert perception.drivable is not None
+        assert not perception.drivable[-perception.size[0] // 4 :].any()
+
+
+def test_an_ego_mask_that_is_none_is_one_line_and_leaves_nothing(
+    folder: Path, tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Image.fromarray(np.zeros((360, 640), np.uint8)).save(tmp_path / "black.png")
+    for name, message in (("black.png", "marks nothing"), ("absent.png", "no such file"), ("a.txt", "not an image")):
+        (tmp_path / "a.txt").write_text("text")
+        words = ["predict", str(folder / "alpha.png"), "--model", str(weights), "--output", str(tmp_path / "out")]
+        assert cli.main([*words, "--ego-mask", str(tmp_path / name)]) == 1
+        written = capsys.readouterr().err
+        assert written.count("\n") == 1
+        assert f"{name}: " in written
+        assert message in written
+    assert not (tmp_path / "out").exists()

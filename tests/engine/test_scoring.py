@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from trilitenet.data.sample import Sample
-from trilitenet.engine.scoring import CanvasPrediction, FairMetrics, PaperMetrics, on_own_car
+from trilitenet.engine.scoring import CanvasPrediction, FairMetrics, PaperMetrics
 from trilitenet.errors import ShapeError
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.structures import Boxes, Perception
@@ -217,12 +217,3 @@ def test_boxes_on_the_own_car_are_not_wrong() -> None:
     metrics = FairMetrics(("vehicle",), ("detection",))
     outcome = metrics.update(labelled, Perception((40, 40), ("vehicle",), found, None, None))
     assert (outcome.right, outcome.wrong, outcome.missed) == (1, 1, 0)  # 10 of 14 and 10 of 28 rows on the bonnet
-
-
-def test_more_than_half_of_a_box_is_on_the_own_car_by_hand() -> None:
-    valid = np.ones((40, 40), np.bool_)
-    valid[30:] = False
-    rows = [(0, 24, 10, 36), (0, 24, 10, 37), (10, 32, 20, 36), (0, 25.4, 10, 35.6), (-5, 35, 10, 90), (3, 3, 3, 3)]
-    # On it: 6 of 12 rows; 7 of 13; all; 6 of the 11 from 25 to 36; all that is in the picture; nothing of nothing.
-    found = on_own_car(valid, np.array(rows, np.float64))
-    assert found.tolist() == [False, True, True, True, True, False]

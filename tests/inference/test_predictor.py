@@ -15,6 +15,7 @@ from trilitenet.config import ArtefactInfo, Thresholds
 from trilitenet.errors import ConfigError, InputError, ShapeError
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.predictor import Predictor
+from trilitenet.processing.ego_mask import EgoMask
 
 
 def check(perception: object, height: int, width: int) -> None:
@@ -179,3 +180,34 @@ def test_images_are_resized_as_in_training_unless_told_otherwise() -> None:
     Predictor(backend)(coloured_scene())
     Predictor(backend, long_side=640)(coloured_scene())
     assert backend.batches == [(1, 192, 320, 3), (1, 384, 640, 3)]
+
+
+def test_nothing_is_found_on_the_own_car() -> None:
+    own = np.zeros((360, 640), np.bool_)
+    own[270:] = True
+    predictor = Predictor(ColourBackend(), ego_mask=EgoMask(own))
+    scenes = [coloured_scene(), coloured_scene(720, 1280)]
+    scenes[0][300:, :200] = (220, 20, 20)  # the red bonnet would make another box of the vehicle's
+    for perception in predictor(scenes):
+        height, width = perception.size
+        assert perception.boxes is not None
+        np.testing.assert_allclose(
+            perception.boxes.xyxy, [[width / 4, height / 4, width / 2, height / 2]], atol=3 * width / 640
+        )
+        for mask in (perception.drivable, perception.lane):
+            assert mask is not None
+            assert mask[height // 2 + 8 : 3 * height // 4].any()
+            assert not mask[3 * height // 4 :].any()
+    np.testing.assert_array_equal(predictor(scenes[0]).image, scenes[0])
+
+
+def test_the_own_car_is_left_out_stage_by_stage_as_in_one_call() -> None:
+    own = np.zeros((360, 640), np.bool_)
+    own[270:] = True
+    predictor = Predictor(ColourBackend(), ego_mask=EgoMask(own))
+    canvas, letterbox = predictor.preprocess(coloured_scene())
+    (perception,) = predictor.postprocess(predictor.backend.run(canvas[None]), [letterbox])
+    assert perception.to_dict() == predictor(coloured_scene()).to_dict()
+    assert not (canvas == Predictor(predictor.backend).preprocess(coloured_scene())[0]).all()
+    with pytest.raises(ShapeError, match="another shape"):
+        predictor(coloured_scene(480, 640))

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from trilitenet.processing.boxes import box_area, box_iou, clip_boxes, cxcywh_to_xyxy, xyxy_to_cxcywh
+from trilitenet.processing.boxes import box_area, box_iou, clip_boxes, cxcywh_to_xyxy, lie_on_mask, xyxy_to_cxcywh
 
 
 def test_forms_are_inverse() -> None:
@@ -24,3 +24,12 @@ def test_area_of_an_inside_out_box_is_zero() -> None:
 
 def test_clip() -> None:
     np.testing.assert_array_equal(clip_boxes(np.array([[-1.0, -1, 700, 500]]), (480, 640)), [[0, 0, 640, 480]])
+
+
+def test_more_than_half_of_a_box_lies_on_a_mask_by_hand() -> None:
+    mask = np.zeros((40, 40), np.bool_)
+    mask[30:] = True
+    rows = [(0, 24, 10, 36), (0, 24, 10, 37), (10, 32, 20, 36), (0, 25.4, 10, 35.6), (-5, 35, 10, 90), (3, 3, 3, 3)]
+    # On it: 6 of 12 rows; 7 of 13; all; 6 of the 11 from 25 to 36; all that is in the picture; nothing of nothing.
+    assert lie_on_mask(np.array(rows, np.float64), mask).tolist() == [False, True, True, True, True, False]
+    assert lie_on_mask(np.zeros((0, 4), np.float32), mask).shape == (0,)

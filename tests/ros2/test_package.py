@@ -210,6 +210,7 @@ def test_a_camera_file_of_another_shape_is_told_and_the_rest_published(
     [
         {"model": "nomodel"},
         {"camera_file": "missing.yaml"},
+        {"ego_mask": "missing.png"},
         {"confidence": 2.0},
         {"confidence": 1},
         {"confidence": "x"},
@@ -221,7 +222,7 @@ def test_a_wrong_parameter_is_one_line(
     monkeypatch.setattr(fakes.Node, "overrides", parameters)
     with pytest.raises(SystemExit) as ended:
         node_module.main()
-    assert re.fullmatch(r"error: .*(nomodel|missing\.yaml|confidence).*", str(ended.value.code))
+    assert re.fullmatch(r"error: .*(nomodel|missing\.yaml|missing\.png|confidence).*", str(ended.value.code))
 
 
 @pytest.mark.parametrize("interrupted", ["load", "spin"])

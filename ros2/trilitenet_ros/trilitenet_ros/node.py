@@ -50,6 +50,7 @@ class PerceptionNode(Node):
             device=self._parameter("device", "auto"),
             backend=self._parameter("backend", "auto"),
             confidence=None if confidence < 0 else confidence,
+            ego_mask=self._parameter("ego_mask", "") or None,
         )
         self._monitor = RoadMonitor(
             read_camera(camera_file) if camera_file else None,

@@ -12,7 +12,8 @@ from trilitenet.config import VARIANTS
 from trilitenet.errors import ConfigError, did_you_mean, needing_torch
 from trilitenet.inference.backend import Backend
 from trilitenet.inference.exported import is_int8_onnx
-from trilitenet.inference.predictor import Predictor
+from trilitenet.inference.predictor import ImageLike, Predictor
+from trilitenet.processing.ego_mask import EgoMask
 
 if TYPE_CHECKING:
     import torch
@@ -51,6 +52,7 @@ def load(
     batch_size: int = 8,
     streams: int = 1,
     threads: int | None = None,
+    ego_mask: ImageLike | None = None,
 ) -> Predictor:
     """Load a model as a predictor.
 
@@ -73,6 +75,8 @@ def load(
         streams: Images that OpenVINO computes at once: more frames a second, more latency. Other runtimes have none.
         threads: Threads of the runtime; its own choice if left out. PyTorch and ExecuTorch have one number for the
             whole process.
+        ego_mask: Where images show the own car, as a picture that is bright there: nothing is found on it; see
+            `EgoMask`.
 
     Returns:
         The predictor.
@@ -82,7 +86,9 @@ def load(
         BackendError: If the device or the runtime is not there.
         MissingExtraError: If the runtime is not installed.
         ConfigError: If an option is unknown, out of range, or of no effect on this model's input.
+        InputError: If the ego mask cannot be read, or marks nothing, or everything.
     """
+    own_car = None if ego_mask is None else EgoMask(ego_mask)
     if backend not in BACKENDS:
         raise ConfigError(f"unknown backend {backend!r}{did_you_mean(backend, BACKENDS)}")
     check_parallel(streams=streams, threads=threads)
@@ -98,7 +104,7 @@ def load(
         given = {"confidence": confidence, "iou": iou, "drivable": drivable, "lane": lane}
         own: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
         thresholds = dataclasses.replace(runtime.card.thresholds, **own)
-        return Predictor(runtime, thresholds, long_side=long_side, batch_size=batch_size)
+        return Predictor(runtime, thresholds, long_side=long_side, batch_size=batch_size, ego_mask=own_car)
     except ConfigError as error:
         runtime.close()
         raise ConfigError(f"{model}: {error}") from error

@@ -216,6 +216,7 @@ def predict(
     smoothing: float = 0.0,
     field_of_view: float | None = None,
     lane_width: float | None = None,
+    ego_mask: StrPath | None = None,
 ) -> PredictReport:
     """Find vehicles, drivable area and lane lines in pictures, folders, videos and streams.
 
@@ -261,6 +262,8 @@ def predict(
         field_of_view: For --road without a camera file: the lens's horizontal field of view in degrees; 60 if left out.
             Many dash-cams have 100 to 140; that lenses bend the edges of pictures takes a camera file.
         lane_width: For --road without a camera file: metres between the lines of a lane; 3.5 if left out.
+        ego_mask: Picture of the own car in view (bonnet, dashboard, pillar), white on black, of the shape of the
+            camera's pictures: nothing is found there, and the network is shown mirrored road in its place.
 
     Returns:
         What was done.
@@ -294,6 +297,7 @@ def predict(
         confidence=confidence,
         long_side=long_side,
         batch_size=batch_size,
+        ego_mask=ego_mask,
     ) as predictor:
         return job.run(predictor, quiet=quiet)
 

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.config import Task
-from trilitenet.engine.scoring import LabelledImage, on_own_car
+from trilitenet.engine.scoring import LabelledImage
 from trilitenet.metrics.detection import in_regions, match_boxes
 from trilitenet.metrics.segmentation import as_binary
+from trilitenet.processing.boxes import lie_on_mask
 from trilitenet.structures import Boxes, Perception
 
 __all__ = ["FALSE", "IGNORED", "MISSED", "RIGHT", "error_overlay", "shrunken"]
@@ -103,7 +104,7 @@ def _draw_boxes(
     right[right] = classes[target[right]] == found.class_id[right]
     excused = in_regions(found.xyxy, sample.ignored)
     if sample.valid is not None and len(found):
-        excused |= on_own_car(sample.valid, found.xyxy)
+        excused |= lie_on_mask(found.xyxy, ~sample.valid)
     for region in np.asarray(sample.ignored, np.float64):
         _rectangle(picture, region, scale, IGNORED)
     for box in np.delete(truth, target[right], axis=0):

@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, Literal, Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +20,7 @@ from trilitenet.metrics.published import (
     PublishedSegmentationScores,
 )
 from trilitenet.metrics.segmentation import SegmentationMetric, SegmentationScores
+from trilitenet.processing.boxes import lie_on_mask
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.structures import Boxes, Perception
 
@@ -33,7 +33,6 @@ __all__ = [
     "PaperMetrics",
     "PaperScores",
     "add_boxes",
-    "on_own_car",
 ]
 
 
@@ -75,18 +74,8 @@ def add_boxes(metric: DetectionMetric, sample: LabelledImage, boxes: Boxes | Non
     labels = sample.boxes, sample.class_id, sample.ignored
     if boxes is None:
         return metric.update(None, None, None, *labels)
-    neutral = None if sample.valid is None or not len(boxes) else on_own_car(sample.valid, boxes.xyxy)
+    neutral = None if sample.valid is None or not len(boxes) else lie_on_mask(boxes.xyxy, ~sample.valid)
     return metric.update(boxes.xyxy, boxes.confidence, boxes.class_id, *labels, neutral)
-
-
-def on_own_car(valid: NDArray[np.bool_], boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Return which (D, 4) xyxy px boxes lie by more than half where (H, W) ``valid`` is False."""
-    sums = cv2.integral((~valid).view(np.uint8))
-    height, width = valid.shape
-    corners = np.rint(boxes).clip(0, (width, height, width, height)).astype(np.intp)
-    left, top, right, bottom = corners.T
-    own = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-    return np.asarray(2 * own > (right - left) * (bottom - top))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,6 +14,7 @@ from PIL import Image
 from trilitenet.config import ArtefactInfo, ModelCard, Thresholds
 from trilitenet.errors import ConfigError
 from trilitenet.inference.backend import Backend
+from trilitenet.processing.ego_mask import EgoMask
 from trilitenet.processing.images import no_image, read_image
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.processing.postprocess import to_perceptions
@@ -43,6 +44,7 @@ class Predictor:
         long_side: The longer side of an image is resized to so many pixels, where the backend's input is not fixed;
             by default that of the size the network was trained at (its card's ``input_size``).
         batch_size: At most so many images go through the network at once.
+        ego_mask: Where images show the own car; nothing is found there.
 
     Raises:
         ConfigError: If a size is not positive, or ``long_side`` above 16384, or the backend's file fixes thresholds
@@ -56,6 +58,7 @@ class Predictor:
         *,
         long_side: int | None = None,
         batch_size: int = 8,
+        ego_mask: EgoMask | None = None,
     ) -> None:
         long_side = max(backend.card.input_size) if long_side is None else long_side
         if min(long_side, batch_size) < 1:
@@ -67,6 +70,7 @@ class Predictor:
         self._check_thresholds()
         self.long_side = long_side
         self.batch_size = batch_size
+        self.ego_mask = ego_mask
 
     @property
     def card(self) -> ModelCard:
@@ -141,6 +145,7 @@ class Predictor:
 
         Raises:
             ConfigError: If there are more or fewer sources than images.
+            ShapeError: If an image is of another shape than the ego mask.
         """
         images = list(images)
         sources = [None] * len(images) if sources is None else list(sources)
@@ -151,7 +156,7 @@ class Predictor:
         for part in _runs([letterbox.canvas for letterbox in letterboxes], self.batch_size):
             batch = np.empty((part.stop - part.start, *letterboxes[part.start].canvas, 3), np.uint8)
             for canvas, image, letterbox in zip(batch, images[part], letterboxes[part], strict=True):
-                letterbox.image(image, out=canvas)
+                self._fill(canvas, image, letterbox)
             raw = self.backend.run(batch)
             perceptions += self.postprocess(raw, letterboxes[part], images[part], sources[part])
         return perceptions
@@ -171,7 +176,14 @@ class Predictor:
             The (canvas height, canvas width, 3) uint8 canvas, and how the image lies in it.
         """
         letterbox = self.fit(image)
-        return letterbox.image(image), letterbox
+        canvas = np.empty((*letterbox.canvas, 3), np.uint8)
+        self._fill(canvas, image, letterbox)
+        return canvas, letterbox
+
+    def _fill(self, canvas: NDArray[np.uint8], image: NDArray[np.uint8], letterbox: Letterbox) -> None:
+        letterbox.image(image, out=canvas)
+        if self.ego_mask is not None:
+            self.ego_mask.hide(canvas, letterbox)
 
     def postprocess(
         self,
@@ -180,8 +192,9 @@ class Predictor:
         images: Sequence[NDArray[np.uint8]] | None = None,
         sources: Sequence[str | None] | None = None,
     ) -> list[Perception]:
-        """Turn the raw outputs of a batch into perceptions; see `to_perceptions`."""
-        return to_perceptions(raw, letterboxes, self.thresholds, self.class_names, images, sources)
+        """Turn the raw outputs of a batch into perceptions; see `to_perceptions`. The own car has none of them."""
+        perceptions = to_perceptions(raw, letterboxes, self.thresholds, self.class_names, images, sources)
+        return perceptions if self.ego_mask is None else [self.ego_mask.drop(each) for each in perceptions]
 
     def __repr__(self) -> str:
         return f"Predictor({self.card.variant} on {self.backend.name})"

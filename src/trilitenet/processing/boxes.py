@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["best_side_ratio", "box_area", "box_iou", "clip_boxes", "cxcywh_to_xyxy", "xyxy_to_cxcywh"]
+__all__ = ["best_side_ratio", "box_area", "box_iou", "clip_boxes", "cxcywh_to_xyxy", "lie_on_mask", "xyxy_to_cxcywh"]
 
 FloatArray = NDArray[np.floating[Any]]
 
@@ -54,3 +55,12 @@ def clip_boxes(xyxy: FloatArray, size: tuple[int, int]) -> NDArray[np.float32]:
     """Return (N, 4) xyxy boxes clipped to an image of ``size`` (height, width), as float32."""
     height, width = size
     return np.clip(xyxy, 0, np.array([width, height, width, height], np.float32)).astype(np.float32, copy=False)
+
+
+def lie_on_mask(xyxy: FloatArray, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which of (N, 4) xyxy boxes lie by more than half where a (height, width) mask is True."""
+    height, width = mask.shape
+    sums = cv2.integral(mask.view(np.uint8))
+    left, top, right, bottom = np.rint(xyxy).clip(0, (width, height, width, height)).astype(np.intp).T
+    inside = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    return np.asarray(2 * inside > (right - left) * (bottom - top))

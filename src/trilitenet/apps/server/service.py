@@ -198,7 +198,9 @@ class Service:
             )
         if confidence is not None:
             thresholds = dataclasses.replace(predictor.thresholds, confidence=confidence)
-            predictor = Predictor(predictor.backend, thresholds, long_side=predictor.long_side)
+            predictor = Predictor(
+                predictor.backend, thresholds, long_side=predictor.long_side, ego_mask=predictor.ego_mask
+            )
         return await in_time(self._stages(image, deadline, finish, predictor, keep_image), deadline)
 
     async def see_all(
