@@ -267,6 +267,18 @@ def test_the_mean_of_two_lies_between_them_and_has_no_figures(tmp_path: Path) ->
         assert all(torch.equal(mean[name], value) for name, value in same.items() if value.is_floating_point())
 
 
+def test_runs_at_two_sizes_have_a_mean_which_names_their_folders(tmp_path: Path) -> None:
+    network = load_network("tiny")
+    for name, size in (("coarse", (256, 448)), ("fine", (512, 896))):
+        (tmp_path / name).mkdir()
+        card = dataclasses.replace(network.card, input_size=size)
+        save_network(network, tmp_path / name / "final.safetensors", card)
+    coarse, fine = (tmp_path / name / "final.safetensors" for name in ("coarse", "fine"))
+    card = average(coarse, fine, tmp_path / "mean.safetensors")
+    assert card.input_size == (512, 896)
+    assert card.provenance["mean of"] == "0.5 of coarse/final.safetensors, 0.5 of fine/final.safetensors"
+
+
 def test_what_has_no_mean_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "mean.safetensors"
     for words, message in (

@@ -114,7 +114,9 @@ def average(
     _check_destination(destination, overwrite=overwrite)
     check_writable(destination)
     mean = average_networks(load_network(first, network), load_network(second, network), share)
-    names = [resolve_weights(each).name for each in (first, second)]
+    files = [resolve_weights(each) for each in (first, second)]
+    alike = files[0].name == files[1].name  # as of two training runs: the folder tells them apart
+    names = [f"{file.absolute().parent.name}/{file.name}" if alike else file.name for file in files]
     provenance = {"mean of": f"{1 - share:g} of {names[0]}, {share:g} of {names[1]}"}
     card = dataclasses.replace(mean.card, metrics={}, provenance=mean.card.provenance | provenance)
     save_network(mean, destination, card)

@@ -9,7 +9,7 @@ from trilitenet.models.trilitenet import TriLiteNet
 
 __all__ = ["average_networks"]
 
-_COMMON = ("variant", "class_names", "tasks", "blocks", "input_size", "mean", "std", "anchors")
+_COMMON = ("variant", "class_names", "tasks", "blocks", "mean", "std", "anchors")
 """What the cards of both must agree in."""
 
 
@@ -21,7 +21,7 @@ def average_networks(first: TriLiteNet, second: TriLiteNet, share: float) -> Tri
 
     Args:
         first: The network before; it is not changed.
-        second: The network after; it becomes the mean, and keeps its card.
+        second: The network after, at the same input size or another; it becomes the mean, and keeps its card.
         share: Of the second, 0 to 1.
 
     Returns:
@@ -29,7 +29,7 @@ def average_networks(first: TriLiteNet, second: TriLiteNet, share: float) -> Tri
 
     Raises:
         ConfigError: If the share is not within 0 and 1.
-        WeightsError: If the two differ in variant, classes, tasks, parts, input size, anchors, mean, std or layers.
+        WeightsError: If the two differ in variant, classes, tasks, parts, anchors, mean, std or layers.
     """
     if not 0 <= share <= 1:
         raise ConfigError(f"share must be 0 to 1, got {share:g}")
