@@ -88,7 +88,7 @@ $(PYTORCH): | $(BIN)/python
 	@touch $@
 
 $(RUNTIME): pyproject.toml $(PYTORCH)
-	$(INSTALL) --editable ".[video]"
+	$(INSTALL) --editable ".[video,heic]"
 	@$(COMPILE)
 	@touch $@
 

@@ -17,9 +17,11 @@ PUBLIC = {
     "__version__",
     "benchmark",
     "build_network",
+    "evaluate",
     "export",
     "load",
     "load_network",
+    "predict",
     "train",
 }
 

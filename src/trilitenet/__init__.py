@@ -20,8 +20,10 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from trilitenet.commands.benchmark import benchmark as benchmark
+    from trilitenet.commands.evaluate import evaluate as evaluate
     from trilitenet.commands.export import export as export
     from trilitenet.commands.load import load as load
+    from trilitenet.commands.predict import predict as predict
     from trilitenet.commands.train import train as train
     from trilitenet.inference.predictor import Predictor as Predictor
     from trilitenet.models.trilitenet import build_network as build_network
@@ -35,9 +37,11 @@ _PUBLIC = {
     "Predictor": "trilitenet.inference.predictor",
     "benchmark": "trilitenet.commands.benchmark",
     "build_network": "trilitenet.models.trilitenet",
+    "evaluate": "trilitenet.commands.evaluate",
     "export": "trilitenet.commands.export",
     "load": "trilitenet.commands.load",
     "load_network": "trilitenet.models.weights",
+    "predict": "trilitenet.commands.predict",
     "train": "trilitenet.commands.train",
 }
 
@@ -48,9 +52,11 @@ __all__ = [
     "__version__",
     "benchmark",
     "build_network",
+    "evaluate",
     "export",
     "load",
     "load_network",
+    "predict",
     "train",
 ]
 

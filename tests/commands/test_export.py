@@ -58,7 +58,7 @@ def test_options_that_do_not_fit(artefacts: Artefacts, tmp_path: Path) -> None:
         ({"precision": "int8"}, "--calibration"),
         ({"size": "100x64"}, "multiples of 32"),
         ({"size": "big"}, "HEIGHTxWIDTH"),
-        ({"size": (384, 640)}, r"HEIGHTxWIDTH such as 384x640, or dynamic, not \(384, 640\)"),
+        ({"size": (384, 640, 3)}, r"HEIGHTxWIDTH such as 384x640, or dynamic, not \(384, 640, 3\)"),
         ({"format": "tflite"}, "unknown format 'tflite'; known: executorch, ncnn, onnx"),
         ({"format": "onxx"}, "did you mean 'onnx'"),
         ({"format": "torch", "nms": True}, "--nms"),
@@ -99,6 +99,19 @@ def test_options_that_do_not_fit(artefacts: Artefacts, tmp_path: Path) -> None:
     (tmp_path / "a.onnx").touch()
     with pytest.raises(OutputError, match="exists already"):
         export(weights, output=tmp_path / "a.onnx")
+
+
+def test_a_size_is_height_by_width_and_turned_round_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    network = build_network("tiny")
+    save_network(network, tmp_path / "small.safetensors", dataclasses.replace(network.card, input_size=(64, 96)))
+    sizes = [None, "64x96", (64, 96), "96x64", "96x96"]
+    for index, size in enumerate(sizes):
+        exported = export(tmp_path / "small.safetensors", output=tmp_path / f"{index}.onnx", size=size)
+        canvas = OnnxBackend(exported.path).canvas
+        assert canvas == {"96x64": (96, 64), "96x96": (96, 96)}.get(str(size), (64, 96))
+    (told,) = caplog.messages
+    assert "--size 96x64 is an upright input, 96 high and 64 wide" in told
+    assert "as trained, 96 wide and 64 high, is --size 64x96" in told
 
 
 def test_an_engine_is_not_called_onnx(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

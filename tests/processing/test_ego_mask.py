@@ -76,10 +76,11 @@ def test_a_mask_that_does_not_reach_the_lower_edge_changes_nothing_that_the_netw
     np.testing.assert_array_equal(canvas, letterbox.image(picture()))
 
 
-def test_a_pillar_from_top_to_bottom_is_no_trouble() -> None:
+def test_a_pillar_from_top_to_bottom_leaves_the_rest_as_it_is() -> None:
     mask = np.zeros((360, 640), np.bool_)
     mask[:, :40] = True
-    hidden(EgoMask(mask), picture())
+    canvas, letterbox = hidden(EgoMask(mask), picture())
+    np.testing.assert_array_equal(canvas[:, 40:], letterbox.image(picture())[:, 40:])
 
 
 def test_what_lies_on_the_own_car_is_dropped() -> None:

@@ -150,9 +150,24 @@ def test_fractions_are_refused_not_taken_for_black(values: list[float]) -> None:
         read_image(encoded(Image.fromarray(np.array([values], np.float32)), "TIFF"))
 
 
-def test_photos_of_phones_are_named_with_the_cure() -> None:
-    with pytest.raises(InputError, match="HEIC images cannot be read; save it as JPEG"):
-        read_image(b"\0\0\0\x18ftypheic" + bytes(100))
+def test_photos_of_phones_are_read_and_turned_once() -> None:
+    pytest.importorskip("pi_heif")
+    path = Path(__file__).with_name("photo.heic")  # 64 wide and 48 high, upright, though its EXIF says turned
+    image = read_image(path)
+    assert image.shape == (48, 64, 3)
+    for row, column, colour in ((5, 5, (220, 30, 30)), (5, 58, (30, 200, 30)), (42, 5, (30, 30, 220))):
+        np.testing.assert_allclose(image[row, column], colour, atol=12)
+    np.testing.assert_array_equal(read_image(path.read_bytes()), image)
+    for broken in (path.read_bytes()[:-100], b"\0\0\0\x18ftypheic" + bytes(100)):
+        with pytest.raises(InputError, match="the image: is not an image that can be read"):
+            read_image(broken)
+
+
+def test_photos_of_phones_are_named_with_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pi_heif", None)
+    path = Path(__file__).with_name("photo.heic")
+    with pytest.raises(InputError, match=r"photo\.heic: this needs 'pi_heif' .*\[heic\]'; or save it as JPEG$"):
+        read_image(path)
 
 
 def test_an_image_without_pixels_is_refused() -> None:

@@ -15,7 +15,7 @@ from typing import Final, Literal
 from trilitenet.commands.evaluate import evaluate, hash_dataset, hash_model, known_report
 from trilitenet.commands.export import PRECISIONS, check_drop, drop_frames, export, find_pictures
 from trilitenet.commands.load import own_builder
-from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, one_for_several
+from trilitenet.commands.paths import NameOrPath, SizeText, StrPath, check_writable, one_for_several
 from trilitenet.commands.tables import PAPER_COLUMNS, markdown_row
 from trilitenet.config import ARTEFACT_SUFFIXES, VARIANTS, Precision
 from trilitenet.data.reading import DrivingDataset
@@ -112,7 +112,7 @@ def evaluate_table(
     output: StrPath,
     precisions: Sequence[Precision] | None = None,
     format: Literal["openvino", "onnx"] = "openvino",
-    size: str | None = None,
+    size: SizeText | None = None,
     split: str = "val",
     calibration: StrPath | None = None,
     calibration_frames: int = 500,
@@ -174,7 +174,7 @@ def evaluate_table(
     for model in [os.fspath(model) for model in models or VARIANTS]:
         card = read_card(model)
         classes = card.class_names
-        canvas = "x".join(map(str, card.input_size)) if size is None else size
+        canvas = size if isinstance(size, str) else "x".join(map(str, size or card.input_size))
         if classes not in hashes:
             hashes[classes] = hash_dataset(DrivingDataset(data, split, class_names=classes), limit)
         stamp = (hash_model(model) or "")[:12]

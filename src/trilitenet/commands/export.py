@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import functools
 import io
+import logging
 import math
 import os
 import re
@@ -20,7 +21,7 @@ from torch.nn.functional import interpolate
 
 import trilitenet
 from trilitenet.commands.load import open_backend
-from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, optional_path
+from trilitenet.commands.paths import NameOrPath, SizeText, StrPath, check_writable, optional_path
 from trilitenet.commands.progress import ProgressBar, show_progress
 from trilitenet.config import (
     ARTEFACT_KEY,
@@ -88,6 +89,7 @@ PRECISIONS: Final[dict[str, tuple[Precision, ...]]] = {
     "triton": ("fp32", "fp16", "int8"),
 }
 """Precisions of a format."""
+_LOGGER: Final = logging.getLogger(__name__)
 _RUNTIMES: Final = {"onnx": "onnxruntime"}
 """Runtimes that are not called as their format is."""
 _PORTABLE: Final = ("ncnn", "executorch", "tensorrt")
@@ -137,7 +139,7 @@ def export(
     format: Format = "onnx",
     output: StrPath | None = None,
     precision: Precision = "fp32",
-    size: str | None = None,
+    size: SizeText | None = None,
     calibration: StrPath | None = None,
     calibration_frames: int = 500,
     max_drop: float | None = None,
@@ -166,8 +168,8 @@ def export(
         output: File to write (for triton, the folder of the repository); by default named after the model, here.
         precision: fp32, fp16 (weights stored so; on Arm, NCNN computes so too), bf16 (OpenVINO) or int8 (needs
             --calibration).
-        size: HEIGHTxWIDTH of the input in multiples of 32, or dynamic (not with int8, --portable, ncnn, executorch or
-            tensorrt); the size that the model was trained at if left out.
+        size: HEIGHTxWIDTH of the input in multiples of 32, such as 384x640, or dynamic (not with int8, --portable,
+            ncnn, executorch or tensorrt); the size that the model was trained at if left out.
         calibration: Frames for INT8: a data set in the published layout (its train split) or a folder of pictures.
         calibration_frames: At most so many of them.
         max_drop: INT8 may lose at most so many points of a score on the val split of --calibration; layers fall back
@@ -196,13 +198,22 @@ def export(
     """
     model, output, calibration, frames = os.fspath(model), *map(optional_path, (output, calibration, frames))
     portable = portable or format in _PORTABLE
-    parsed = read_card(model).input_size if size is None else _parse_size(size)
+    usual = read_card(model).input_size
+    parsed = usual if size is None else _parse_size(size)
     _check_options(
         format, precision, parsed, calibration, calibration_frames, max_drop, nms, portable, masks, mask_scale, layout
     )
     path = _destination(model, format, output)
     _check_files(path, format, overwrite)
     trained = load_network(model, network)
+    if parsed == usual[::-1] != usual and format != "triton":  # the export inside it says so
+        _LOGGER.warning(
+            "--size %dx%d is an upright input, %d high and %d wide; as trained, %d wide and %d high, is --size %dx%d",
+            *parsed,
+            *parsed,
+            *parsed,
+            *usual,
+        )
     if nms and "detection" not in trained.tasks:
         raise ConfigError(f"{model} has no detection task, so there are no boxes to suppress; leave --nms out")
     if format == "triton":
@@ -371,11 +382,12 @@ def _check_files(path: Path, format: Format, overwrite: bool) -> None:
         check_writable(file)
 
 
-def _parse_size(size: str) -> tuple[int, int] | None:
+def _parse_size(size: SizeText) -> tuple[int, int] | None:
     """Return (height, width), None for dynamic."""
     if size == "dynamic":
         return None
-    match = re.fullmatch(r"(\d+)x(\d+)", str(size))  # two numbers, say, from Python
+    words = "x".join(map(str, size)) if isinstance(size, (tuple, list)) else size
+    match = re.fullmatch(r"(\d+)x(\d+)", words)
     if match is None:
         raise ConfigError(f"--size is HEIGHTxWIDTH such as 384x640, or dynamic, not {size!r}")
     canvas = int(match[1]), int(match[2])

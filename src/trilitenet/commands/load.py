@@ -99,7 +99,7 @@ def load(
             height, width = runtime.canvas
             raise ConfigError(
                 f"its input is fixed to {width}x{height}, so long_side has no effect; leave it out, or export it with "
-                "another --size"
+                "another --size HEIGHTxWIDTH"
             )
         given = {"confidence": confidence, "iou": iou, "drivable": drivable, "lane": lane}
         own: dict[str, Any] = {name: value for name, value in given.items() if value is not None}

@@ -1,4 +1,4 @@
-"""Paths of commands: texts in their place, and one for several, in the Python API; whether one can be written."""
+"""Arguments in the Python API: texts for paths and sizes, and one for several; whether a path can be written."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 
 from trilitenet.errors import OutputError, writing
 
-__all__ = ["NameOrPath", "StrPath", "check_writable", "one_for_several", "optional_path"]
+__all__ = ["NameOrPath", "SizeText", "StrPath", "check_writable", "one_for_several", "optional_path"]
 
 if TYPE_CHECKING:
     StrPath: TypeAlias = str | Path
     NameOrPath: TypeAlias = str | Path
+    SizeText: TypeAlias = str | tuple[int, int]
 else:  # what the command line makes of words, and calls them in its help
     StrPath = Path
     NameOrPath = str
+    SizeText = str
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 

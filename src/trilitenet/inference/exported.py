@@ -98,7 +98,8 @@ def prepare_input(image: NDArray[np.uint8], info: ArtefactInfo) -> NDArray[Any]:
     size = image.shape[:2]
     if info.size is not None and size != info.size:
         raise ShapeError(
-            f"this artefact takes {info.size[1]}x{info.size[0]} pixels, got {size[1]}x{size[0]}; export another --size"
+            f"this artefact takes {info.size[1]}x{info.size[0]} pixels, got {size[1]}x{size[0]}; "
+            f"for these: export --size {size[0]}x{size[1]}"
         )
     if info.colour == "bgr":
         image = image[:, :, ::-1]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
-from trilitenet.errors import InputError, ShapeError
+from trilitenet.errors import InputError, MissingExtraError, ShapeError, import_extra
 from trilitenet.processing.addresses import as_address
 
 __all__ = ["BROKEN", "no_image", "open_image", "read_image", "to_rgb", "upright_size"]
@@ -47,7 +47,7 @@ def read_image(image: str | Path | bytes | Image.Image | NDArray[Any]) -> NDArra
     """Read an image of any common kind into one form.
 
     The rotation that a camera noted in EXIF is applied. Grey, palette and CMYK images become RGB, alpha is dropped,
-    16-bit grey is scaled to 8 bit.
+    16-bit grey is scaled to 8 bit. HEIC and HEIF, the photos of many phones, take the extra ``heic``.
 
     Args:
         image: A path, the bytes of an image file, a Pillow image, or an array as `to_rgb` takes.
@@ -80,10 +80,11 @@ def read_image(image: str | Path | bytes | Image.Image | NDArray[Any]) -> NDArra
     if not data:
         raise InputError(f"{name}: is empty")
     try:
-        opened = open_image(io.BytesIO(data))
+        heif = data[4:8] == b"ftyp" and data[8:12] in _HEIF
+        opened = _open_heif(data) if heif else open_image(io.BytesIO(data))
+    except MissingExtraError as error:
+        raise InputError(f"{name}: {error}; or save it as JPEG") from error
     except BROKEN as error:
-        if data[4:8] == b"ftyp" and data[8:12] in _HEIF:
-            raise InputError(f"{name}: HEIC images cannot be read; save it as JPEG") from error
         raise InputError(f"{name}: is not an image that can be read ({_reason(error)})") from error
     with opened:
         return _decode(opened, name)
@@ -106,6 +107,17 @@ def open_image(file: Path | io.BytesIO) -> Image.Image:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         return Image.open(file)
+
+
+def _open_heif(data: bytes) -> Image.Image:
+    """Open the bytes of a HEIC or HEIF file; it is turned by its own means, which EXIF but repeats.
+
+    Raises:
+        MissingExtraError: If the extra ``heic`` is not installed.
+        ValueError: Or another of `BROKEN`, if it cannot be read.
+    """
+    picture: Image.Image = import_extra("pi_heif", "heic").open_heif(io.BytesIO(data)).to_pillow()
+    return picture
 
 
 def to_rgb(array: NDArray[Any]) -> NDArray[np.uint8]:

@@ -73,6 +73,9 @@ def test_scans_count_by_the_size_of_the_picture() -> None:
 
 def test_the_largest_allowed_image_is_8k() -> None:
     check_header(Header("PNG", 7680, 4320, 1), Settings())
+    with pytest.raises(ProblemError) as caught:
+        check_header(Header("PNG", 7680, 4321, 1), Settings())
+    assert caught.value.status == 413
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP"])
