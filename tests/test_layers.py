@@ -46,6 +46,27 @@ def test_a_logger_of_a_module_has_one_name_and_is_used() -> None:
         assert not names or "_LOGGER." in text, path
 
 
+def test_what_one_module_takes_from_another_is_in_its_all() -> None:
+    modules: dict[str, ast.Module] = {}
+    for path in PACKAGE.rglob("*.py"):
+        parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+        modules[".".join(parts).removesuffix(".__init__")] = ast.parse(path.read_text(encoding="utf-8"))
+    told: dict[str, set[str]] = {}
+    for name, tree in modules.items():
+        for node in tree.body:
+            if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["__all__"]:
+                told[name] = set(ast.literal_eval(node.value))
+    hidden = {
+        f"{node.module}.{alias.name}"
+        for tree in modules.values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module in modules
+        for alias in node.names
+        if alias.name not in told.get(node.module, set())
+    }
+    assert hidden - modules.keys() == set()
+
+
 def test_no_folder_is_a_drawer_for_anything() -> None:
     names = {path.stem for path in PACKAGE.rglob("*") if path.is_dir() or path.suffix == ".py"}
     assert not names & {"utils", "util", "common", "misc", "helpers"}

@@ -58,6 +58,7 @@ __all__ = [
     "folder_beside",
     "gist",
     "import_extra",
+    "needing_torch",
     "part_of",
     "replacing",
     "scratch_folder",

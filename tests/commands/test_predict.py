@@ -208,7 +208,7 @@ def test_a_video_that_fails_in_its_middle_is_counted_with_its_frames(
             raise ShapeError("another shape")
         return perception, None
 
-    monkeypatch.setattr("trilitenet.commands.predict._follow", follow)
+    monkeypatch.setattr("trilitenet.commands.predict.follow", follow)
     report = predict_with(predictor, [drive(tmp_path / "drive.mp4")], tmp_path / "out", overlay=overlay)
     assert (report.videos, report.frames, len(report.failures)) == (1, 3, 1)
 
@@ -220,7 +220,7 @@ def test_a_camera_file_is_read_once(tmp_path: Path, predictor: Predictor, monkey
         read.append(path)
         return Camera.from_field_of_view((90, 160), 90, height=1.4)
 
-    monkeypatch.setattr("trilitenet.commands.predict.read_camera", read_camera)
+    monkeypatch.setattr("trilitenet.commands.predict_road.read_camera", read_camera)
     for number in range(3):
         Image.fromarray(coloured_scene(90, 160)).save(tmp_path / f"{number}.png")
     road = RoadOptions(camera=Path("camera.yaml"))
@@ -390,7 +390,7 @@ def test_a_shard_opens_neither_what_others_do_nor_what_is_done(
     assert predict_with(predictor, videos, tmp_path / "out", **options).videos == 2
     assert opened == ["1", "3"]
     read: list[str] = []
-    monkeypatch.setattr("trilitenet.commands.predict._check_source", lambda path, name: read.append(path.stem))
+    monkeypatch.setattr("trilitenet.commands.predict_plan._check_source", lambda path, name: read.append(path.stem))
     assert predict_with(predictor, videos, tmp_path / "out", **options).skipped == 2
     assert opened == read == ["1", "3"]
 

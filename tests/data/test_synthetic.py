@@ -16,9 +16,10 @@ from PIL import Image
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.sample import Sample
 from trilitenet.data.synthetic import Scene, SyntheticScenes
-from trilitenet.data.synthetic_chance import random_layout, random_world
+from trilitenet.data.synthetic_chance import random_world
 from trilitenet.data.synthetic_drive import SyntheticDrive
 from trilitenet.data.synthetic_files import annotation, write_dataset
+from trilitenet.data.synthetic_layout import random_layout
 from trilitenet.data.synthetic_render import FIRST_VEHICLE, render
 from trilitenet.data.synthetic_vehicles import VehiclePose, draw_shadow, in_front
 from trilitenet.data.synthetic_world import FAR, Course, Vehicle

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from trilitenet.config import ARTEFACT_KEY, ArtefactInfo, ModelCard
-from trilitenet.deploy.triton import read_tensors, write_triton_repository
+from trilitenet.deploy.triton import write_triton_repository
 from trilitenet.errors import OutputError, WeightsError
 
 onnx = pytest.importorskip("onnx")
@@ -107,9 +108,10 @@ def test_types_are_named_as_triton_names_them(tmp_path: Path) -> None:
     outputs = [helper.make_tensor_value_info(f"{kind}2", getattr(onnx.TensorProto, kind), [1]) for kind in kinds]
     nodes = [helper.make_node("Identity", [kind], [f"{kind}2"]) for kind in kinds]
     model = helper.make_model(helper.make_graph(nodes, "g", values, outputs), ir_version=9)
+    helper.set_model_props(model, {ARTEFACT_KEY: ArtefactInfo("onnx").to_json()})
     onnx.save(model, tmp_path / "a.onnx")
-    inputs, made = read_tensors(tmp_path / "a.onnx")
-    assert [one.datatype for one in inputs] == [one.datatype for one in made] == list(kinds.values())
+    config = write_triton_repository(tmp_path / "a.onnx", tmp_path / "out", ModelCard("tiny")) / "config.pbtxt"
+    assert re.findall(r"data_type: TYPE_(\w+)", config.read_text(encoding="utf-8")) == [*kinds.values()] * 2
 
 
 def test_a_broken_graph_is_named(tmp_path: Path) -> None:

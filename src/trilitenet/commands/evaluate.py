@@ -14,7 +14,7 @@ from typing import Any, Final, Literal
 from trilitenet.commands.load import load
 from trilitenet.commands.paths import NameOrPath, StrPath, check_writable, one_for_several, optional_path
 from trilitenet.commands.progress import show_progress
-from trilitenet.config import ArtefactInfo, ModelCard, Task, shipped_weights
+from trilitenet.config import ModelCard, Task, shipped_weights
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.engine.evaluate import LOWEST_CONFIDENCE, EvaluatedPredictor
 from trilitenet.engine.evaluate import evaluate as run_evaluation
@@ -24,10 +24,20 @@ from trilitenet.engine.report import Report, Variation, read_report
 from trilitenet.engine.robustness import corrupted_figures, figures_by_size
 from trilitenet.engine.scorecard import CONDITIONS, GROUP, PAPER_THRESHOLDS
 from trilitenet.errors import ConfigError, DataError, OutputError
+from trilitenet.inference.backend import artefact_info
 from trilitenet.inference.predictor import LONGEST_SIDE, Predictor
 from trilitenet.processing.corruptions import SEVERITIES
 
-__all__ = ["evaluate", "hash_dataset", "hash_model", "known_report", "warn_of_unlabelled", "write_report"]
+__all__ = [
+    "check_counts",
+    "check_output",
+    "evaluate",
+    "hash_dataset",
+    "hash_model",
+    "known_report",
+    "warn_of_unlabelled",
+    "write_report",
+]
 
 _LOGGER: Final = logging.getLogger(__name__)
 
@@ -200,7 +210,7 @@ def _check_artefact(model: str, predictor: Predictor, protocol: str) -> None:
     Raises:
         ConfigError: If it has.
     """
-    info: ArtefactInfo | None = getattr(predictor.backend, "info", None)
+    info = artefact_info(predictor.backend)
     if info is None:
         return
     if info.nms and "detection" in predictor.card.tasks:

@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
-import json
-import logging
-import os
-import re
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path, PurePath
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -22,106 +17,27 @@ from rich.text import Text
 
 from trilitenet.commands.load import load
 from trilitenet.commands.paths import NameOrPath, StrPath, one_for_several
+from trilitenet.commands.predict_marks import Marks
+from trilitenet.commands.predict_plan import RATE, Plan, read_list
+from trilitenet.commands.predict_road import RoadOptions, follow
+from trilitenet.commands.preview import Window, WindowClosed
 from trilitenet.commands.progress import show_bars
-from trilitenet.errors import (
-    LONGEST_NAME,
-    BackendError,
-    ConfigError,
-    FreeNames,
-    InputError,
-    OutputError,
-    ShapeError,
-    part_of,
-    replacing,
-    shown,
-    writing,
-)
-from trilitenet.formats.writers.base import Writer, file_stem, find_writer, open_writer, uninterrupted
+from trilitenet.errors import InputError, ShapeError, replacing, writing
+from trilitenet.formats.writers.base import Writer, open_writer, uninterrupted
 from trilitenet.inference.predictor import Predictor
-from trilitenet.inference.sources import (
-    Clip,
-    Failure,
-    FrameReader,
-    SequenceReader,
-    Stills,
-    find_sources,
-    silent_opencv,
-)
+from trilitenet.inference.sources import Clip, Failure, FrameReader, Stills, silent_opencv
 from trilitenet.inference.video import PerceptionStream, VideoWriter
-from trilitenet.processing.drawing import PARTS, check_parts, draw
-from trilitenet.processing.geometry import Camera
-from trilitenet.road.camera import read_camera
+from trilitenet.processing.drawing import PARTS, draw
 from trilitenet.road.drawing import ROAD_PARTS, draw_road
-from trilitenet.road.monitor import RoadMonitor
 from trilitenet.road.structures import Road
-from trilitenet.road.tracking import Steady
 from trilitenet.structures import Perception
 
 __all__ = ["PredictReport", "RoadOptions", "predict", "predict_with"]
 
-_LOGGER: Final = logging.getLogger(__name__)
-_HEAD: Final = 65536
-"""Bytes of a JSON file in which its source is named, though the file may be as long as a video."""
 _JPEG_QUALITY: Final = 92
 """Of overlays on pictures, of 100."""
-_RATE: Final = 30.0
-"""Frames a second of numbered pictures, unless others are asked for."""
 _MOST_BARS: Final = 10
 """Of more sources than these, only the bar of the one at hand is shown, below that of all."""
-
-
-@dataclasses.dataclass(frozen=True)
-class RoadOptions:
-    """What is wanted beyond the single frame.
-
-    Attributes:
-        measure: Lanes as curves, and, with a camera, metres; done with a camera file in any case.
-        camera: A camera file (see `trilitenet.road.camera.read_camera`); estimated from the lanes if None.
-        track: Give vehicles identities.
-        smoothing: How much masks are averaged over time, in [0, 1).
-        field_of_view: Horizontal field of view in degrees that is assumed without a camera file; 60 if None.
-        lane_width: Metres between the lines of a lane, likewise; 3.5 if None.
-    """
-
-    measure: bool = False
-    camera: StrPath | None = None
-    track: bool = False
-    smoothing: float = 0.0
-    field_of_view: float | None = None
-    lane_width: float | None = None
-
-    def open(self, *, still: bool) -> tuple[Steady | None, RoadMonitor | None]:
-        """Return what follows one video, or what looks at one picture.
-
-        Raises:
-            ConfigError: If the camera file is wrong, a number out of range, or an assumption without effect.
-            MissingExtraError: If vehicles shall be tracked and the extra ``track`` is not installed.
-        """
-        assumed: dict[str, Any] = {
-            name: value
-            for name, value in (("field_of_view", self.field_of_view), ("lane_width", self.lane_width))
-            if value is not None
-        }
-        if assumed and (self.camera is not None or not self.measure):
-            names = " and ".join(f"--{name.replace('_', '-')}" for name in assumed)
-            why = "with --camera nothing is assumed" if self.camera is not None else "that is for --road"
-            raise ConfigError(f"{names} would change nothing: {why}")
-        steady = None
-        if not still and (self.track or self.smoothing):
-            steady = Steady(track=self.track, smoothing=self.smoothing)
-        if not self.wanted:
-            return steady, None
-        return steady, RoadMonitor(self._mounted, still=still, **assumed)
-
-    @property
-    def wanted(self) -> bool:
-        """Whether the road is looked at."""
-        return self.measure or self.camera is not None
-
-    @functools.cached_property
-    def _mounted(self) -> Camera | None:
-        """The camera that the file describes."""
-        return None if self.camera is None else read_camera(self.camera)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,7 +121,7 @@ def predict(
     start: float = 0.0,
     end: float | None = None,
     max_frames: int | None = None,
-    rate: float = _RATE,
+    rate: float = RATE,
     long_side: int | None = None,
     batch_size: int = 4,
     preview: bool = False,
@@ -224,8 +140,8 @@ def predict(
     stream cleanly: what was written until then is whole and can be played.
 
     Args:
-        sources: Pictures, videos, folders, glob patterns, numbered pictures (frames/%06d.jpg), RTSP or HTTP URLs, a
-            camera's number (0), - for a video on standard input.
+        sources: Pictures, videos, folders (the files directly in them), glob patterns, numbered pictures
+            (frames/%06d.jpg), RTSP or HTTP URLs, a camera's number (0), - for a video on standard input.
         output: Folder for the results.
         model: Name of shipped weights, a weight file, or an exported artefact of any runtime.
         network: The function that built a weight file's network, where it is one of your own: FILE.py:FUNCTION or
@@ -275,8 +191,8 @@ def predict(
     options = RoadOptions(road, camera, track, smoothing, field_of_view, lane_width)
     options.open(still=False)  # what is wrong with them is told before any work
     clip = Clip(every=every, start=start, end=end, max_frames=max_frames)
-    job = _Job(
-        [*sources, *(_read_list(from_file) if from_file is not None else ())],
+    plan = Plan(
+        [*sources, *(read_list(from_file) if from_file is not None else ())],
         output,
         clip,
         format,
@@ -299,7 +215,7 @@ def predict(
         batch_size=batch_size,
         ego_mask=ego_mask,
     ) as predictor:
-        return job.run(predictor, quiet=quiet)
+        return _Run(plan, predictor).run(quiet=quiet)
 
 
 @one_for_several
@@ -315,7 +231,7 @@ def predict_with(
     overwrite: bool = False,
     skip_existing: bool = False,
     shard: str | None = None,
-    rate: float = _RATE,
+    rate: float = RATE,
     preview: bool = False,
     quiet: bool = True,
     road: RoadOptions | None = None,
@@ -324,7 +240,7 @@ def predict_with(
 
     Arguments are as there; ``clip`` says which frames of videos are wanted, ``road`` what is beyond the single frame.
     """
-    job = _Job(
+    plan = Plan(
         sources,
         output,
         clip or Clip(),
@@ -338,260 +254,59 @@ def predict_with(
         preview=preview,
         road=road or RoadOptions(),
     )
-    return job.run(predictor, quiet=quiet)
+    return _Run(plan, predictor).run(quiet=quiet)
 
 
-class _Job:
-    """Sources and the names of their results; made, and refused, before any work begins."""
+class _Run:
+    """What is done of a plan, and what is left of it to report."""
 
-    def __init__(
-        self,
-        sources: Sequence[str | Path],
-        output: StrPath,
-        clip: Clip,
-        formats: Sequence[str],
-        *,
-        hide: Sequence[str],
-        overlay: bool,
-        overwrite: bool,
-        skip_existing: bool,
-        shard: str | None,
-        rate: float,
-        preview: bool,
-        road: RoadOptions,
-    ) -> None:
-        _check_hide(hide, drawn=overlay or preview, road=road.wanted)
-        if overwrite and skip_existing:
-            raise ConfigError("--skip-existing and --overwrite exclude each other; choose one")
-        if not sources:
-            raise InputError("no source was given: name a picture, a folder, a video, a URL or a camera's number")
-        self.output = Path(output)
-        self.overlay = overlay
-        self.hide = hide
-        self.preview = preview
-        self.road = road
-        self.clip = clip
-        part = _parse_shard(shard)
-        self.sources, self.failures = find_sources(sources, clip, rate=rate, unopened=True)
-        if part is None or part[0] == 0:
-            self._tell_idle_options(rate)
-        self.formats = tuple(dict.fromkeys(formats))
-        self.overwrite = overwrite or skip_existing  # then what exists is of a source that is done anew
-        self.names = self._left()
-        self.stems = _allot_stems(self.names)
-        self._leave_out_long_names()
-        if part is not None:
-            self._keep_shard(*part)
-        self.skipped = self._leave_out_done() if skip_existing else 0
-        self._check_output()
-        self._check_formats()
-        self.writers: list[Writer] = []
-        self.images = self.videos = self.frames = self.dropped = 0
+    def __init__(self, plan: Plan, predictor: Predictor) -> None:
+        self.plan = plan
+        self.predictor = predictor
+        self.marks = Marks(plan)
+        self.failures = list(plan.failures)
         self.files: list[Path] = []
-        self.unfinished: dict[str, bool] = {}
-        self.marked = self.whole = self.endless = False
-        self.gathered = [self.output / file for file, holds in self._shared() if holds]
+        self.images = self.videos = self.frames = self.dropped = 0
+        self.endless = False
+        self.writers: list[Writer] = []
+        self.window: Window | None = None
 
-    def _tell_idle_options(self, rate: float) -> None:
-        """Warn of options for videos alone where there is none, not even among what cannot be used."""
-        if not self.sources or self.failures:
-            return
-        fields = dataclasses.fields(Clip)
-        idle = [field.name for field in fields if getattr(self.clip, field.name) != field.default]
-        idle += [name for name in ("track", "smoothing") if getattr(self.road, name)]
-        if idle and not any(isinstance(source, FrameReader) for source in self.sources):
-            names = " and ".join(f"--{name.replace('_', '-')}" for name in idle)
-            _LOGGER.warning("%s without effect: no source is a video", names)
-        if rate != _RATE and not any(isinstance(source, SequenceReader) for source in self.sources):
-            _LOGGER.warning("--rate without effect: no source is numbered pictures, such as frames/%06d.jpg")
-
-    def _leave_out_long_names(self) -> None:
-        """Make a source whose results would have longer names than file systems take a failure of its own."""
-        fitting: set[str] = set()
-        for source in self.sources:
-            patterns = [pattern for name in self.formats for pattern in _patterns(find_writer(name), source)]
-            endings = [PurePath(pattern).name.replace("*", "0000000").format("") for pattern in patterns]
-            longest = max(map(len, [".jpg", *endings]))
-            reason = "its name is too long for the names of its results; rename it"
-            for name in _names(source):
-                if len(os.fsencode(self.stems[name])) + longest <= LONGEST_NAME:
-                    fitting.add(name)
-                else:
-                    self.failures.append(Failure(name, f"{name}: {reason}"))
-        self._keep(fitting)
-
-    def _keep_shard(self, index: int, count: int) -> None:
-        """Leave out what other shards do, every so many-th source; what cannot be used is told by the first."""
-        self._keep(set(self.names[index::count]))
-        if index:
-            self.failures.clear()
-
-    def _leave_out_done(self) -> int:
-        """Leave out the sources whose results are all there and whole, and return how many.
-
-        Raises:
-            ConfigError: If a format gathers several sources in one file.
-            OutputError: If results that are there say that they are of another source of the same name.
-        """
-        for file, _ in self._shared():
-            raise ConfigError(
-                f"--skip-existing needs formats with a file for each source, and {file} is one for all; choose another "
-                "--format, or --overwrite"
-            )
-        if "json" in self.formats:
-            for name in self._left():
-                _check_source(self.output / f"{self.stems[name]}.json", name)
-        left = {
-            name
-            for source in self.sources
-            for name in _names(source)
-            if self._mark(name).exists() or not all(path.exists() for path in self._files(source, name))
-        }
-        before = len(self._left())
-        self._keep(left)
-        return before - len(left)
-
-    def _left(self) -> list[str]:
-        """Return the names of the sources, and of the pictures among them, that are to be done."""
-        return [name for source in self.sources for name in _names(source)]
-
-    def _keep(self, names: Collection[str]) -> None:
-        """Leave out the sources, and the pictures among them, of other names."""
-        sources: list[Stills | FrameReader] = []
-        for source in self.sources:
-            if isinstance(source, Stills):
-                source = Stills(tuple(path for path in source.paths if str(path) in names))
-            if any(name in names for name in _names(source)):
-                sources.append(source)
-        self.sources = sources
-
-    def _files(self, source: Stills | FrameReader, name: str) -> list[Path]:
-        """Return the files that are a source's alone."""
-        patterns = [pattern for each in self.formats for pattern in _patterns(find_writer(each), source)]
-        if self.overlay:
-            patterns.append("{}.jpg" if isinstance(source, Stills) else "{}.mp4")
-        return [self.output / pattern.format(self.stems[name]) for pattern in patterns]
-
-    def _mark(self, name: str) -> Path:
-        """Return the file that is there while the results of a video are not of all its frames."""
-        return part_of(self.output / f"{self.stems[name]}.unfinished")
-
-    def _shared(self) -> Iterator[tuple[str, bool]]:
-        """Yield the names of the files that are one for all sources, and whether they hold what is of each."""
-        for name in self.formats:
-            writer = find_writer(name)
-            patterns = {pattern for source in self.sources for pattern in _patterns(writer, source)}
-            files = [pattern for pattern in (*writer.FILES, *sorted(patterns)) if "{}" not in pattern]
-            yield from ((file, writer.GATHERS) for file in files)
-
-    def _mark_gathered(self) -> None:
-        """Leave the marks of the files of all sources, which hold but some of them until the run's end."""
-        self.marked = True
-        for file in self.gathered:
-            with writing(file):
-                _mark_of(file).touch()
-
-    def _remove_gathered_marks(self) -> None:
-        """Remove the marks of files that hold all sources, and of those that were not written."""
-        for file in self.gathered if self.marked else ():
-            if self.whole or not file.exists():
-                with writing(file):
-                    _mark_of(file).unlink(missing_ok=True)
-
-    def _mark_unfinished(self, name: str) -> None:
-        """Leave the mark of a video that was not done to its end."""
-        if self.unfinished.get(name):
-            self._mark(name).touch()
-
-    def _remove_marks(self) -> None:
-        """Remove the marks of videos that were done to their end, and of those that have no results."""
-        for source in self.sources:
-            if isinstance(source, FrameReader) and source.name in self.unfinished:
-                mark = self._mark(source.name)
-                if not (self.unfinished[source.name] and any(map(Path.exists, self._files(source, source.name)))):
-                    with writing(mark):
-                        mark.unlink(missing_ok=True)
-
-    def _check_output(self) -> None:
-        if self.output.exists() and not self.output.is_dir():
-            raise OutputError(f"{self.output}: is a file; give a folder for --output")
-        stems = {self.stems[name] for name in self._left()}
-        folders = [folder for folder in (self.output, self.output / "labels") if folder.is_dir()]
-        alike = [
-            path for folder in folders for path in sorted(folder.iterdir()) if path.stem in stems and path.is_file()
-        ]
-        originals = {Path(name).resolve() for name in self.names if Path(name).exists()} if alike else set()
-        for path in alike:
-            if path.resolve() in originals:
-                raise OutputError(f"{path}: results would lie beside their source; choose another --output")
-            if not self.overwrite:
-                raise OutputError(f"{path}: exists already; choose another --output or add --overwrite")
-
-    def _check_formats(self) -> None:
-        """Refuse formats that do not exist, and files that exist or would be written twice."""
-        planned: dict[str, str] = {}
-        for file, what in sorted(self._plan(), key=lambda one: "*" not in one[0]):
-            for taken in {file, _numbered(file)} & planned.keys():
-                raise OutputError(
-                    f"{self.output / file} would be written twice, {planned[taken]} and {what}; "
-                    "rename a source, or give the formats an --output each"
-                )
-            planned[file] = what
-        if self.overwrite:
-            return
-        found = [self.output / file for file in planned if (self.output / file).exists()]
-        for folder in {(self.output / file).parent for file in planned if "*" in file}:
-            for path in folder.iterdir() if folder.is_dir() else ():
-                if _numbered(path.relative_to(self.output).as_posix()) in planned:
-                    found.append(path)
-        if found:
-            raise OutputError(f"{found[0]}: exists already; choose another --output or add --overwrite")
-
-    def _plan(self) -> Iterator[tuple[str, str]]:
-        """Yield each file that the formats will write, ``*`` for a number a frame, and what it is."""
-        for name in self.formats:
-            writer = find_writer(name)
-            files = dict.fromkeys(writer.FILES, "everything")
-            for source in self.sources:
-                patterns = _patterns(writer, source)
-                files |= {pattern.format(self.stems[each]): each for pattern in patterns for each in _names(source)}
-            yield from ((file, f"as {name} of {each}") for file, each in files.items())
-
-    def run(self, predictor: Predictor, *, quiet: bool) -> PredictReport:
+    def run(self, *, quiet: bool) -> PredictReport:
         """Do the work."""
-        self.window = _Window() if self.preview else None
+        plan = self.plan
+        self.window = Window() if plan.preview else None
         began = time.perf_counter()
         interrupted = False
         with contextlib.ExitStack() as stack:
-            stack.enter_context(writing(self.output))
-            stack.callback(self._remove_marks)  # once all files have their names
-            stack.callback(self._remove_gathered_marks)
-            if self.sources:
-                self.output.mkdir(parents=True, exist_ok=True)
-                for name in self.formats:
-                    writer = stack.enter_context(open_writer(name, self.output, overwrite=self.overwrite))
+            stack.enter_context(writing(plan.output))
+            stack.callback(self.marks.remove_unfinished)  # once all files have their names
+            stack.callback(self.marks.remove_gathered)
+            if plan.sources:
+                plan.output.mkdir(parents=True, exist_ok=True)
+                for name in plan.formats:
+                    writer = stack.enter_context(open_writer(name, plan.output, overwrite=plan.overwrite))
                     self.writers.append(writer)
-                    for source_name in self.names:  # the same names as the overlays, whichever source fails
+                    for source_name in plan.names:  # the same names as the overlays, whichever source fails
                         writer.stem(source_name)
             columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), _Speed())
             progress = stack.enter_context(show_bars(*columns, TimeRemainingColumn(), quiet=quiet))
             if self.window is not None:
                 stack.enter_context(contextlib.closing(self.window))
-            many = len(self.sources) > _MOST_BARS
-            all_of_them = progress.add_task("all sources", total=len(self.sources)) if many else None
+            many = len(plan.sources) > _MOST_BARS
+            all_of_them = progress.add_task("all sources", total=len(plan.sources)) if many else None
             source: Stills | FrameReader | None = None
             try:
-                for source in self.sources:
-                    self._run_source(source, predictor, progress)
+                for source in plan.sources:
+                    self._run_source(source, progress)
                     if all_of_them is not None:
                         for task in progress.task_ids[1:]:
                             progress.remove_task(task)
                         progress.advance(all_of_them)
-                self.whole = True
-            except (_WindowClosed, KeyboardInterrupt) as error:
+                self.marks.whole = True
+            except (WindowClosed, KeyboardInterrupt) as error:
                 interrupted = isinstance(error, KeyboardInterrupt)
                 # A live source that comes last has no other end, and so there is no rest.
-                self.whole = self.endless and source is self.sources[-1]
+                self.marks.whole = self.endless and source is plan.sources[-1]
         return PredictReport(
             images=self.images,
             videos=self.videos,
@@ -599,14 +314,14 @@ class _Job:
             seconds=time.perf_counter() - began,
             failures=tuple(self.failures),
             files=tuple(self.files),
-            output=self.output,
+            output=plan.output,
             interrupted=interrupted,
-            skipped=self.skipped,
-            partial=tuple(self.gathered) if self.marked and not self.whole else (),
+            skipped=plan.skipped,
+            partial=self.marks.partial,
             dropped=self.dropped,
         )
 
-    def _run_source(self, source: Stills | FrameReader, predictor: Predictor, progress: Progress) -> None:
+    def _run_source(self, source: Stills | FrameReader, progress: Progress) -> None:
         self.endless = False
         if isinstance(source, FrameReader):
             try:
@@ -623,13 +338,13 @@ class _Job:
         with contextlib.ExitStack() as stack:
             if isinstance(source, FrameReader):
                 self.videos += 1
-                if self.overlay:
-                    rate = None if source.rate is None else source.rate / self.clip.every
-                    video = VideoWriter(self.output / f"{self.stems[source.name]}.mp4", rate)
+                if self.plan.overlay:
+                    rate = None if source.rate is None else source.rate / self.plan.clip.every
+                    video = VideoWriter(self.plan.output / f"{self.plan.stems[source.name]}.mp4", rate)
                     stack.enter_context(video)
-                stack.callback(self._mark_unfinished, source.name)  # before any of its results has its name
-            follow = self.road.open(still=False) if isinstance(source, FrameReader) else None
-            stream = stack.enter_context(PerceptionStream(source, predictor))
+                stack.callback(self.marks.mark_unfinished, source.name)  # before any of its results has its name
+            watching = self.plan.road.open(still=False) if isinstance(source, FrameReader) else None
+            stream = stack.enter_context(PerceptionStream(source, self.predictor))
             try:
                 for item in stream:
                     if isinstance(item, Failure):
@@ -638,21 +353,21 @@ class _Job:
                         if video is not None and isinstance(source, FrameReader) and not video.frames:
                             video.pixel_aspect = source.pixel_aspect
                         try:
-                            perception, road = _follow(item, follow or self.road.open(still=True))
+                            perception, road = follow(item, watching or self.plan.road.open(still=True))
                         except ShapeError as error:  # of another shape than the camera's pictures
                             if isinstance(source, FrameReader):
                                 raise InputError(f"{source.name}: {error}") from error
                             self.failures.append(Failure(str(item.source), f"{item.source}: {error}"))
                         else:
                             if isinstance(source, FrameReader):
-                                self.unfinished[source.name] = True
+                                self.marks.begin(source.name)
                             self._take(perception, road, video)
                     progress.advance(task)
                 if isinstance(source, FrameReader):
                     # What another run left of other parts of the video stays.
-                    for writer in self.writers if self.clip == Clip(every=self.clip.every) else ():
+                    for writer in self.writers if self.plan.clip == Clip(every=self.plan.clip.every) else ():
                         writer.remove_remains(source.name)
-                    self.unfinished[source.name] = False
+                    self.marks.finish(source.name)
             except InputError as error:
                 assert isinstance(source, FrameReader)
                 self.failures.append(Failure(source.name, str(error)))
@@ -670,30 +385,29 @@ class _Job:
             InputError: If the frames of a video are too large for an overlay; a picture that is becomes a failure.
         """
         with uninterrupted():
-            if not self.marked:
-                self._mark_gathered()
+            self.marks.mark_gathered()
             for writer in self.writers:
                 writer.write(perception, None if road is None else road.to_dict())
             if perception.frame is None:
                 self.images += 1
             else:
                 self.frames += 1
-            if not self.overlay and self.window is None:
+            if not self.plan.overlay and self.window is None:
                 return
             assert perception.image is not None
             # The frame is ours alone from here on: drawing on it saves a copy.
-            picture = draw(perception, hide=[part for part in self.hide if part in PARTS], out=perception.image)
+            picture = draw(perception, hide=[part for part in self.plan.hide if part in PARTS], out=perception.image)
             if road is not None:
-                draw_road(picture, perception, road, hide=[part for part in self.hide if part in ROAD_PARTS])
+                draw_road(picture, perception, road, hide=[part for part in self.plan.hide if part in ROAD_PARTS])
             cure = "add --no-overlay for the other results alone"
             if video is not None:
                 try:
                     video.write(picture, perception.timestamp)
                 except ShapeError as error:
                     raise InputError(f"{perception.source}: an overlay cannot be made ({error}); {cure}") from error
-            elif self.overlay and perception.frame is None:
+            elif self.plan.overlay and perception.frame is None:
                 assert perception.source is not None
-                path = self.output / f"{self.stems[perception.source]}.jpg"
+                path = self.plan.output / f"{self.plan.stems[perception.source]}.jpg"
                 if _write_jpeg(path, picture):
                     self.files.append(path)
                 else:
@@ -702,105 +416,6 @@ class _Job:
                     self.failures.append(Failure(perception.source, f"{perception.source}: {reason}"))
         if self.window is not None:
             self.window.show(picture)
-
-
-def _follow(perception: Perception, parts: tuple[Steady | None, RoadMonitor | None]) -> tuple[Perception, Road | None]:
-    """Return a perception with what its video adds to it, and its road, which smoothed masks would blur in time."""
-    steady, monitor = parts
-    drivable, lane = perception.drivable, perception.lane
-    if steady is not None:
-        perception = steady(perception)
-    if monitor is None:
-        return perception, None
-    return perception, monitor(dataclasses.replace(perception, drivable=drivable, lane=lane))
-
-
-def _check_hide(hide: Sequence[str], *, drawn: bool, road: bool) -> None:
-    """Check which parts of the overlay are to be left out.
-
-    Raises:
-        ConfigError: If one does not exist, or would not be drawn anyway.
-    """
-    check_parts(hide, PARTS + ROAD_PARTS)
-    if hide and not drawn:
-        raise ConfigError("--hide would change nothing: with --no-overlay nothing is drawn")
-    idle = [part for part in hide if part in ROAD_PARTS]
-    if idle and not road:
-        raise ConfigError(f"--hide {' '.join(idle)} would change nothing: that is for --road")
-
-
-def _read_list(path: StrPath) -> list[str]:
-    """Return the lines of a text file that are not empty.
-
-    Raises:
-        InputError: If it cannot be read, or names nothing.
-    """
-    try:
-        names = [line for line in map(str.strip, Path(path).read_text(encoding="utf-8-sig").splitlines()) if line]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({getattr(error, 'strerror', None) or error})") from error
-    if not names:
-        raise InputError(f"{path}: names no source; write one a line")
-    return names
-
-
-def _parse_shard(shard: str | None) -> tuple[int, int] | None:
-    """Return the number of a shard and how many there are.
-
-    Raises:
-        ConfigError: If it is none.
-    """
-    if shard is None:
-        return None
-    found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", shard)
-    if found is None or not int(found[1]) < int(found[2]):
-        raise ConfigError(f"--shard must be I/N with I from 0 to N - 1, such as 0/16, got {shown(shard)}")
-    return int(found[1]), int(found[2])
-
-
-def _check_source(path: Path, name: str) -> None:
-    """Refuse results in JSON of another file than the source called ``name``, where both are there to compare.
-
-    Raises:
-        OutputError: If they are.
-    """
-    if not path.is_file():
-        return
-    with path.open("rb", buffering=0) as file:
-        found = re.match(rb'{"schema": "[^"]*", "source": ("(?:[^"\\]|\\.)*")', file.read(_HEAD))
-    told = json.loads(found[1]) if found else name
-    if told == name:  # as for nearly all of a million pictures
-        return
-    other = Path(told)
-    if other.exists() and Path(name).exists() and not other.samefile(name):
-        raise OutputError(
-            f"{path}: is of {other}, not of {name}; name the same sources in the same order as before, "
-            "or another --output"
-        )
-
-
-def _mark_of(file: Path) -> Path:
-    """Return the file that is there while one of several sources lacks some of them."""
-    return part_of(file.with_name(f"{file.name}.unfinished"))
-
-
-def _names(source: Stills | FrameReader) -> list[str]:
-    return [str(path) for path in source.paths] if isinstance(source, Stills) else [source.name]
-
-
-def _patterns(writer: type[Writer], source: Stills | FrameReader) -> tuple[str, ...]:
-    return writer.PICTURE_FILES if isinstance(source, Stills) else writer.VIDEO_FILES
-
-
-def _numbered(file: str) -> str:
-    """Return the name of a frame's file with ``*`` for its number, any other as it is."""
-    return re.sub(r"-\d{7,}(\.\w+)$", r"-*\1", file)  # a frame has seven digits at least
-
-
-def _allot_stems(names: Sequence[str]) -> dict[str, str]:
-    """Return a file name without ending for each source; the second ``a`` becomes ``a-2``."""
-    free = FreeNames(files=True)
-    return {name: free.give(file_stem(name)) for name in dict.fromkeys(names)}
 
 
 def _write_jpeg(path: Path, image: NDArray[np.uint8]) -> bool:
@@ -820,30 +435,3 @@ class _Speed(ProgressColumn):
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
         return Text("" if speed is None else f"{speed:.1f}/s")
-
-
-class _WindowClosed(Exception):  # noqa: N818 - a request, not an error
-    """The user closed the preview."""
-
-
-class _Window:
-    """The live preview; q or Escape ends the run."""
-
-    _TITLE = "trilitenet"
-
-    def __init__(self) -> None:
-        try:
-            cv2.namedWindow(self._TITLE, cv2.WINDOW_NORMAL)
-        except cv2.error as error:
-            raise BackendError(
-                "this OpenCV has no windows; for --preview: pip uninstall opencv-python-headless, then "
-                "pip install opencv-python"
-            ) from error
-
-    def show(self, image: NDArray[np.uint8]) -> None:
-        cv2.imshow(self._TITLE, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-        if cv2.waitKey(1) & 0xFF in (ord("q"), 27):
-            raise _WindowClosed
-
-    def close(self) -> None:
-        cv2.destroyWindow(self._TITLE)

@@ -73,7 +73,7 @@ try:
 except ModuleNotFoundError:  # on Windows
     fcntl = None  # type: ignore[assignment]
 
-__all__ = ["PreparedDataset", "default_cache", "is_prepared", "open_dataset", "prepare"]
+__all__ = ["CACHE_FOLDER", "PreparedDataset", "default_cache", "is_prepared", "open_dataset", "prepare"]
 
 _LOGGER: Final = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from trilitenet.data.synthetic_world import World
 from trilitenet.errors import ConfigError
 from trilitenet.processing.geometry import Camera
 
-__all__ = ["LineTruth", "ObjectTruth", "Scene", "SceneTruth", "SyntheticScenes"]
+__all__ = ["LaneLabels", "LineTruth", "ObjectTruth", "Scene", "SceneTruth", "SyntheticScenes", "label_scene"]
 
 LaneLabels = Literal["lines", "paint"]
 LineKind = Literal["solid", "dashed", "double", "kerb"]

@@ -1,4 +1,4 @@
-"""Draws synthetic worlds by chance: cameras, light, roads, traffic and scenery, as different as can be."""
+"""Draws synthetic worlds by chance: cameras, light, traffic and scenery, as different as can be."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import Final, Literal
 
 import numpy as np
 
+from trilitenet.data.synthetic_layout import random_layout
 from trilitenet.data.synthetic_world import (
-    Barrier,
     Colour,
     Course,
     Item,
     Layout,
     Light,
-    Marking,
     SceneKind,
     TimeOfDay,
     Vehicle,
@@ -26,7 +25,6 @@ from trilitenet.processing.geometry import Camera
 
 __all__ = [
     "random_camera",
-    "random_layout",
     "random_light",
     "random_scenery",
     "random_traffic",
@@ -143,146 +141,6 @@ def random_light(rng: np.random.Generator) -> Light:
         lamps=time != "day" or (weather in ("rain", "fog") and rng.random() < 0.7),
         wet=float(rng.uniform(0.4, 1.0)) if weather == "rain" else 0.0,
     )
-
-
-def random_layout(rng: np.random.Generator, kind: SceneKind) -> Layout:
-    """Draw the cross-section of a road with traffic on the right."""
-    width = {"motorway": 3.65, "country": 3.2, "city": 3.2, "residential": 3.0, "one-way": 3.2}[kind]
-    width *= float(rng.uniform(0.92, 1.06))
-    paint = float(rng.uniform(0.10, 0.20))
-    wear = float(rng.uniform(0.0, 0.75)) ** 1.5
-    american = rng.random() < 0.5
-    separator: Literal["white", "yellow"] = "yellow" if american and kind != "one-way" else "white"
-    dash, gap = [(3.0, 9.0), (6.0, 12.0), (6.0, 6.0), (4.0, 4.0), (3.0, 4.5), (2.0, 4.0)][int(rng.integers(6))]
-    own = {"motorway": int(rng.integers(2, 5)), "city": int(rng.integers(1, 4)), "one-way": int(rng.integers(2, 4))}
-    count = own.get(kind, 1)
-    ego = int(rng.integers(count))
-    right, left = -(ego + 0.5) * width, (count - ego - 0.5) * width
-    lanes = tuple(right + (i + 0.5) * width for i in range(count))
-    markings = [
-        Marking(right + i * width, paint, dash, gap, wear=wear) if rng.random() < 0.93 else
-        Marking(right + i * width, paint, wear=wear)
-        for i in range(1, count)
-    ]  # fmt: skip
-    kerbs: tuple[float, ...] = ()
-    barriers: list[Barrier] = []
-    oncoming: tuple[float, ...] = ()
-    parking: list[float] = []
-    opposite: tuple[float, float] | None = None
-    pavement = 0.0
-    metal: Colour = (168.0, 172.0, 175.0)
-    green: Colour = (52.0, 72.0, 38.0)
-
-    if kind == "motorway":
-        hard, inner = float(rng.uniform(0.8, 3.2)), float(rng.uniform(0.4, 1.4))
-        markings += [
-            Marking(right, paint * 1.3, wear=wear * 0.5),
-            Marking(left, paint, colour="yellow" if american else "white", wear=wear * 0.5),
-        ]
-        paved = (right - hard, left + inner)
-        drivable = (right, left)
-        median = float(rng.uniform(1.2, 8.0))
-        opposite = (paved[1] + median, paved[1] + median + count * width + 3.0)
-        oncoming = tuple(opposite[0] + 1.0 + (i + 0.5) * width for i in range(count))
-        if rng.random() < 0.7:
-            for i in range(count + 1):
-                broken = 0 < i < count
-                mark = Marking(opposite[0] + 1.0 + i * width, paint, dash * broken, gap * broken, wear=wear)
-                markings.append(mark)
-        if median < 5.0 or rng.random() < 0.5:
-            rail = rng.random() < 0.6
-            barriers.append(
-                Barrier(paved[1] + 0.4, "rail" if rail else "concrete", 0.75 if rail else 0.9,
-                        metal if rail else (150.0, 148.0, 142.0))
-            )  # fmt: skip
-        if rng.random() < 0.55:
-            barriers.append(Barrier(paved[0] - 0.5, "rail", 0.75, metal, *_stretch(rng)))
-        if rng.random() < 0.2:
-            barriers.append(Barrier(paved[0] - 4.0, "wall", float(rng.uniform(2, 5)), (140.0, 135.0, 125.0)))
-    elif kind == "country":
-        style = int(rng.integers(5))
-        far = left + width
-        if style == 0:
-            markings.append(Marking(left, paint, colour=separator, wear=wear))
-        elif style < 3:
-            markings.append(Marking(left, paint, dash, gap, colour=separator, wear=wear))
-        else:
-            second = (dash, gap) if style == 4 else (0.0, 0.0)
-            markings.append(Marking(left - 0.14, 0.11, colour=separator, wear=wear))
-            markings.append(Marking(left + 0.14, 0.11, *second, colour=separator, wear=wear, twin=True))
-        verge = float(rng.uniform(0.15, 1.2))
-        if rng.random() < 0.75:
-            markings += [Marking(right, paint, wear=wear), Marking(far, paint, wear=wear)]
-        paved, drivable, oncoming = (right - verge, far + verge), (right, left), (left + width / 2,)
-        if rng.random() < 0.3:
-            barriers.append(Barrier(paved[0] - 0.5, "rail", 0.75, metal, *_stretch(rng)))
-        if rng.random() < 0.25:
-            barriers.append(Barrier(paved[1] + 1.5, "hedge", float(rng.uniform(1.2, 2.8)), green, *_stretch(rng)))
-        if rng.random() < 0.25:
-            barriers.append(Barrier(paved[0] - 2.0, "hedge", float(rng.uniform(1.0, 2.5)), green, *_stretch(rng)))
-    elif kind == "city":
-        far = left + count * width
-        oncoming = tuple(left + (i + 0.5) * width for i in range(count))
-        markings += [Marking(left + i * width, paint, dash, gap, wear=wear) for i in range(1, count)]
-        if rng.random() < 0.5:
-            markings.append(Marking(left - 0.14, 0.11, colour=separator, wear=wear))
-            markings.append(Marking(left + 0.14, 0.11, colour=separator, wear=wear, twin=True))
-        else:
-            markings.append(Marking(left, paint, dash, gap, colour=separator, wear=wear))
-        sides = [2.3 if rng.random() < 0.45 else float(rng.uniform(0.2, 0.8)) for _ in range(2)]
-        if sides[0] > 1:
-            parking.append(right - 1.2)
-            if rng.random() < 0.5:
-                markings.append(Marking(right, 0.11, wear=wear))
-        if sides[1] > 1:
-            parking.append(far + 1.2)
-        paved, drivable = (right - sides[0], far + sides[1]), (right, left)
-        kerbs, pavement = (paved[0], paved[1]), float(rng.uniform(1.5, 4.0))
-    elif kind == "one-way":
-        sides = [2.3 if rng.random() < 0.4 else float(rng.uniform(0.1, 0.5)) for _ in range(2)]
-        if sides[0] > 1:
-            parking.append(right - 1.2)
-        if sides[1] > 1:
-            parking.append(left + 1.2)
-        paved, drivable = (right - sides[0], left + sides[1]), (right, left)
-        kerbs, pavement = (paved[0], paved[1]), float(rng.uniform(1.5, 4.0))
-    else:
-        far = left + width * float(rng.uniform(0.7, 1.0))
-        paved = drivable = (right, far)
-        oncoming = (left + width * 0.4,)
-        if rng.random() < 0.5:
-            paved = (right - 2.2, far)
-            parking.append(right - 1.1)
-        kerbs, pavement = (paved[0], paved[1]), float(rng.choice([0.0, 1.5, 2.5]))
-    shade = float(rng.uniform(72, 132))
-    brown = rng.random() < 0.25
-    verge_colour = (112.0, 98.0, 70.0) if brown else (84.0, float(rng.uniform(86, 106)), 56.0)
-    terrain = (120.0, 104.0, 76.0) if brown else (78.0, float(rng.uniform(80, 100)), 52.0)
-    if pavement:
-        verge_colour = (130.0, 126.0, 120.0) if rng.random() < 0.6 else verge_colour
-    return Layout(
-        kind=kind,
-        lane_width=width,
-        drivable=drivable,
-        paved=paved,
-        opposite=opposite,
-        markings=tuple(markings),
-        kerbs=kerbs,
-        pavement=pavement,
-        barriers=tuple(barriers),
-        lanes=lanes,
-        oncoming=oncoming,
-        parking=tuple(parking),
-        asphalt=(shade, shade * float(rng.uniform(0.97, 1.01)), shade * float(rng.uniform(0.94, 1.04))),
-        verge=verge_colour,
-        terrain=terrain,
-        rough=float(rng.uniform(0.6, 1.6)),
-    )
-
-
-def _stretch(rng: np.random.Generator) -> tuple[float, float]:
-    start = float(rng.uniform(0, 40)) if rng.random() < 0.4 else 0.0
-    return start, start + float(rng.uniform(40, 200))
 
 
 _PAINTS: Final[tuple[Colour, ...]] = (

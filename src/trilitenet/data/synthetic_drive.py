@@ -8,19 +8,17 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from trilitenet.config import as_size
 from trilitenet.data.synthetic import Scene, label_scene
-from trilitenet.data.synthetic_chance import random_layout, random_light, random_scenery, random_vehicle
+from trilitenet.data.synthetic_chance import random_light, random_scenery, random_vehicle
+from trilitenet.data.synthetic_layout import random_layout
 from trilitenet.data.synthetic_render import render
 from trilitenet.data.synthetic_world import FAR, Course, Item, Layout, Light, TimeOfDay, Vehicle, Weather, World
 from trilitenet.errors import ConfigError
-from trilitenet.processing.geometry import Camera
+from trilitenet.processing.geometry import Camera, Floats
 
 __all__ = ["SyntheticDrive"]
-
-Floats = NDArray[np.float64]
 
 _CHUNK: Final = 150.0
 """Metres of scenery that are drawn up at once."""

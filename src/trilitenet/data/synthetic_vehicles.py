@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.data.synthetic_world import Colour, Vehicle
-from trilitenet.processing.geometry import Camera
+from trilitenet.processing.geometry import Camera, Floats
 
 __all__ = ["SHAPES", "SHIFT", "Lamp", "Shape", "VehiclePose", "draw_shadow", "draw_vehicle", "fixed", "in_front"]
 
-Floats = NDArray[np.float64]
 Surface = Literal["body", "glass", "roof", "dark", "cargo"]
 Tone = Callable[[Colour, float, float], tuple[float, float, float]]
 """(colour, x forward in metres, y left in metres) -> colour under the scene's light and haze."""

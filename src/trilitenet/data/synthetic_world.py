@@ -12,23 +12,25 @@ from collections.abc import Callable
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from trilitenet.processing.geometry import Camera
+from trilitenet.processing.geometry import Camera, Floats
 
 __all__ = [
     "FAR",
     "Barrier",
+    "Colour",
     "Course",
     "Item",
     "Layout",
     "Light",
     "Marking",
+    "SceneKind",
+    "TimeOfDay",
     "Vehicle",
+    "Weather",
     "World",
 ]
 
-Floats = NDArray[np.float64]
 Colour = tuple[float, float, float]
 SceneKind = Literal["motorway", "country", "city", "residential", "one-way"]
 TimeOfDay = Literal["day", "dusk", "night"]

@@ -17,12 +17,12 @@ from typing import Any, Final, NamedTuple
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ModelCard
 from trilitenet.errors import OutputError, WeightsError, folder_beside, import_extra, writing
 
-__all__ = ["TensorSpec", "read_tensors", "write_triton_repository"]
+__all__ = ["write_triton_repository"]
 
 _ONNX_TYPES: Final = {1: "FP32", 2: "UINT8", 3: "INT8", 6: "INT32", 7: "INT64", 9: "BOOL", 10: "FP16", 11: "FP64"}
 
 
-class TensorSpec(NamedTuple):
+class _TensorSpec(NamedTuple):
     """An input or output of an artefact.
 
     Attributes:
@@ -90,16 +90,6 @@ def _copy(folder: Path, target: Path, without: Collection[str]) -> None:
             shutil.copy2(entry, target / entry.name, follow_symlinks=False)
 
 
-def read_tensors(artefact: Path) -> tuple[list[TensorSpec], list[TensorSpec]]:
-    """Return the inputs and the outputs of an ``.onnx`` file.
-
-    Raises:
-        WeightsError: If the file is broken.
-        MissingExtraError: If onnx is not installed.
-    """
-    return _tensors(_load(artefact).graph)
-
-
 def _load(artefact: Path) -> Any:
     """Return an ``onnx.ModelProto``."""
     onnx = import_extra("onnx", "onnx")
@@ -109,18 +99,19 @@ def _load(artefact: Path) -> Any:
         raise WeightsError(f"{artefact}: is no ONNX model ({error})") from error
 
 
-def _tensors(graph: Any) -> tuple[list[TensorSpec], list[TensorSpec]]:
+def _tensors(graph: Any) -> tuple[list[_TensorSpec], list[_TensorSpec]]:
+    """Return the inputs and the outputs of an ``onnx.GraphProto``."""
     constants = {tensor.name for tensor in graph.initializer}
 
-    def spec(value: Any) -> TensorSpec:
+    def spec(value: Any) -> _TensorSpec:
         tensor = value.type.tensor_type
         shape = tuple(axis.dim_value if axis.HasField("dim_value") else -1 for axis in tensor.shape.dim)
-        return TensorSpec(value.name, _ONNX_TYPES[tensor.elem_type], shape)
+        return _TensorSpec(value.name, _ONNX_TYPES[tensor.elem_type], shape)
 
     return [spec(v) for v in graph.input if v.name not in constants], [spec(v) for v in graph.output]
 
 
-def _config(name: str, inputs: list[TensorSpec], outputs: list[TensorSpec], parameters: Mapping[str, str]) -> str:
+def _config(name: str, inputs: list[_TensorSpec], outputs: list[_TensorSpec], parameters: Mapping[str, str]) -> str:
     lines = [
         f"name: {_quote(name)}",
         'backend: "onnxruntime"',
@@ -136,7 +127,7 @@ def _config(name: str, inputs: list[TensorSpec], outputs: list[TensorSpec], para
     return "\n".join(lines) + "\n"
 
 
-def _tensor(field: str, tensor: TensorSpec) -> str:
+def _tensor(field: str, tensor: _TensorSpec) -> str:
     shape = ", ".join(map(str, tensor.shape))
     return f"{field} [ {{ name: {_quote(tensor.name)}, data_type: TYPE_{tensor.datatype}, dims: [ {shape} ] }} ]"
 

@@ -32,7 +32,6 @@ _COSTS: Final = ("parameters, M", "multiply-adds, G")
 """Columns of what published models cost."""
 _COSTS_WIDTH: Final = 110
 """Text of fewer characters a line leaves them out."""
-FloatArray = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -207,7 +206,7 @@ def compare_reports(
     )
 
 
-def _spread(report: Report, resamples: int, seed: int, groups: Sequence[int] | None) -> dict[str, FloatArray]:
+def _spread(report: Report, resamples: int, seed: int, groups: Sequence[int] | None) -> dict[str, NDArray[np.float64]]:
     """Return figure key -> (resamples,) values; the same seed draws the same images for every report."""
     return {
         f"{protocol}/{name}": values

@@ -25,6 +25,7 @@ __all__ = [
     "WandbLogger",
     "build_loggers",
     "check_loggers",
+    "read_csv",
 ]
 
 _LOGGER: Final = logging.getLogger(__name__)

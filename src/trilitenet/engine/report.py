@@ -37,6 +37,10 @@ __all__ = [
     "Variation",
     "WorstFrame",
     "read_report",
+    "render",
+    "text_width",
+    "titled_table",
+    "without_nan",
 ]
 
 REPORT_SCHEMA: Final = 1

@@ -11,7 +11,7 @@ from typing import Any, Final, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import ModelCard
+from trilitenet.config import ArtefactInfo, ModelCard
 from trilitenet.errors import BackendError, ShapeError
 from trilitenet.processing.cores import usable_cores
 from trilitenet.structures import RawOutputs
@@ -20,6 +20,7 @@ __all__ = [
     "MOST_PARALLEL",
     "Backend",
     "ParallelSessions",
+    "artefact_info",
     "check_batch",
     "check_process",
     "held",
@@ -148,6 +149,9 @@ class Backend(Protocol):
         card: What the network is: classes, normalisation, thresholds.
         name: The runtime and the device, for reports: ``"torch cpu"``.
         canvas: (height, width) in pixels if the input size is fixed; None if any multiples of 32 will do.
+
+    Some have more, which is looked for and may be lacking: ``info`` (see `artefact_info`), ``streams`` (so many images
+    are computed at once) and ``in_parallel`` (see `ParallelSessions`).
     """
 
     @property
@@ -174,3 +178,9 @@ class Backend(Protocol):
     def close(self) -> None:
         """Free what the runtime holds. Calling it twice is harmless."""
         ...
+
+
+def artefact_info(backend: Backend) -> ArtefactInfo | None:
+    """Return how an artefact takes pixels and returns results; None of a backend that runs none."""
+    info: ArtefactInfo | None = getattr(backend, "info", None)
+    return info

@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from trilitenet.config import ArtefactInfo, ModelCard, Thresholds
+from trilitenet.config import ModelCard, Thresholds
 from trilitenet.errors import ConfigError
-from trilitenet.inference.backend import Backend
+from trilitenet.inference.backend import Backend, artefact_info
 from trilitenet.processing.ego_mask import EgoMask
 from trilitenet.processing.images import no_image, read_image
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.processing.postprocess import to_perceptions
 from trilitenet.structures import Perception, RawOutputs
 
-__all__ = ["ImageLike", "Predictor"]
+__all__ = ["LONGEST_SIDE", "ImageLike", "Predictor"]
 
 ImageLike: TypeAlias = str | Path | bytes | Image.Image | NDArray[Any]
 """A path, the bytes of an image file, a Pillow image, or a (height, width, 3) uint8 **RGB** array."""
@@ -80,11 +80,11 @@ class Predictor:
     @property
     def least_confidence(self) -> float:
         """Boxes below are gone before they could be asked for: an artefact with ``--nms`` drops them inside."""
-        info: ArtefactInfo | None = getattr(self.backend, "info", None)
+        info = artefact_info(self.backend)
         return self.card.thresholds.confidence if info is not None and info.nms else 0.0
 
     def _check_thresholds(self) -> None:
-        info: ArtefactInfo | None = getattr(self.backend, "info", None)
+        info = artefact_info(self.backend)
         wanted, inside = self.thresholds, self.card.thresholds
         if info is None:
             return

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["box_area", "box_cover", "box_overlap", "mean_known", "ratio", "weighted_sum"]
+__all__ = ["FloatArray", "box_area", "box_cover", "box_overlap", "mean_known", "ratio", "weighted_sum"]
 
 FloatArray = NDArray[np.float64]
 

@@ -16,11 +16,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
+from trilitenet.metrics.arithmetic import FloatArray
 from trilitenet.processing.cores import usable_cores
 
 __all__ = ["bootstrap", "draws", "interval"]
 
-FloatArray = NDArray[np.float64]
 _CHUNK = 100
 _THREADS = 2
 

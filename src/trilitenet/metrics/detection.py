@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.errors import ShapeError
-from trilitenet.metrics.arithmetic import box_area, box_cover, box_overlap, mean_known, ratio, weighted_sum
+from trilitenet.metrics.arithmetic import FloatArray, box_area, box_cover, box_overlap, mean_known, ratio, weighted_sum
 from trilitenet.metrics.ranking import RankedBoxes, RankedSums
 from trilitenet.metrics.rows import Rows, pack_tables, unpack_tables
 
@@ -42,8 +42,6 @@ __all__ = [
     "match_boxes",
     "precision_recall_curve",
 ]
-
-FloatArray = NDArray[np.float64]
 
 IOU_THRESHOLDS: Final = tuple(round(0.5 + 0.05 * step, 2) for step in range(10))
 """IoU a box must reach, for AP50:95."""

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.errors import ConfigError, ShapeError
-from trilitenet.metrics.arithmetic import ratio, weighted_sum
+from trilitenet.metrics.arithmetic import FloatArray, ratio, weighted_sum
 from trilitenet.metrics.rows import Rows
 from trilitenet.metrics.segmentation import (
     SegmentationMetric,
@@ -36,8 +36,6 @@ from trilitenet.metrics.segmentation import (
 )
 
 __all__ = ["LaneMetric", "LaneScores", "boundary", "draw_at_width", "thin"]
-
-FloatArray = NDArray[np.float64]
 
 
 def boundary(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.errors import ConfigError
-from trilitenet.metrics.arithmetic import box_overlap, mean_known, ratio, weighted_sum
+from trilitenet.metrics.arithmetic import FloatArray, box_overlap, mean_known, ratio, weighted_sum
 from trilitenet.metrics.detection import (
     IOU_THRESHOLDS,
     DetectionCurve,
@@ -45,8 +45,6 @@ __all__ = [
     "PublishedSegmentationScores",
     "published_average_precision",
 ]
-
-FloatArray = NDArray[np.float64]
 
 
 def _zero_ratio(numerator: FloatArray, denominator: FloatArray) -> FloatArray:

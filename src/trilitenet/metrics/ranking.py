@@ -13,9 +13,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from trilitenet.metrics.arithmetic import FloatArray
+
 __all__ = ["RankedBoxes", "RankedSums"]
 
-FloatArray = NDArray[np.float64]
 _BLOCK: Final = 1_000_000
 """Numbers held at once while summing."""
 

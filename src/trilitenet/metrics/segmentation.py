@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.errors import ShapeError
-from trilitenet.metrics.arithmetic import ratio, weighted_sum
+from trilitenet.metrics.arithmetic import FloatArray, ratio, weighted_sum
 from trilitenet.metrics.rows import Rows
 
 __all__ = [
@@ -34,8 +34,6 @@ __all__ = [
     "confusion",
     "confusion_figures",
 ]
-
-FloatArray = NDArray[np.float64]
 
 
 def as_binary(mask: NDArray[Any], valid: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:

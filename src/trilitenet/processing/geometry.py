@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from trilitenet.errors import ConfigError
 
-__all__ = ["Camera"]
+__all__ = ["Camera", "Floats"]
 
 Floats = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilitenet.processing.boxes import box_iou
-from trilitenet.processing.geometry import Camera
+from trilitenet.processing.geometry import Camera, Floats
 from trilitenet.road.camera import CameraErrors
 from trilitenet.road.structures import LATE, EgoLane, Estimate, GroundCurve, LaneLine, LeadVehicle
 from trilitenet.structures import Boxes
@@ -31,8 +31,6 @@ __all__ = [
     "fit_ego_lane",
     "ground_curve",
 ]
-
-Floats = NDArray[np.float64]
 
 REACH: Final = 70.0
 """Metres ahead that lines are used to."""

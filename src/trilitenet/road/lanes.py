@@ -20,8 +20,6 @@ from trilitenet.road.structures import LaneLine
 
 __all__ = ["VanishingPoint", "assign_positions", "find_lines", "vanishing_point"]
 
-Floats = NDArray[np.float64]
-
 WORK_WIDTH: Final = 640
 """Masks are searched at this width in pixels; all distances below are at this width."""
 ROW_STEPS: Final = (2, 4)

@@ -24,7 +24,7 @@ from trilitenet.apps.server.settings import BYTES_PER_PIXEL, WEBP_BYTES_PER_PIXE
 from trilitenet.errors import InputError
 from trilitenet.processing.images import read_image
 
-__all__ = ["Header", "MemoryBudget", "Reservation", "check_header", "decode", "read_header"]
+__all__ = ["Header", "MemoryBudget", "Reservation", "check_header", "decode", "read_body", "read_header", "too_large"]
 
 _MAX_SEGMENTS: Final = 1_000
 """Segments of a JPEG, of which its header, metadata and scans are made; each costs 10 microseconds."""

@@ -20,7 +20,18 @@ from trilitenet.data.reading import IMAGE_ENDINGS
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, ObjectLabel, RunLabel
 from trilitenet.errors import ConfigError, DataError, brief
 
-__all__ = ["SPLIT_NAMES", "LabelMapping", "MaskRule", "parse_colour", "read_mapping", "visible"]
+__all__ = [
+    "SPLIT_NAMES",
+    "LabelMapping",
+    "Labels",
+    "MaskRule",
+    "find_image",
+    "hull",
+    "parse_colour",
+    "read_json",
+    "read_mapping",
+    "visible",
+]
 
 SPLIT_NAMES: Final = {
     "train": "train",

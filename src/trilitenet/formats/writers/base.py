@@ -34,7 +34,20 @@ from trilitenet.structures import Perception
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["WRITERS", "GrowingFile", "JsonStream", "Writer", "file_stem", "find_writer", "open_writer", "uninterrupted"]
+__all__ = [
+    "WRITERS",
+    "GrowingFile",
+    "JsonStream",
+    "Writer",
+    "dumps",
+    "file_stem",
+    "find_writer",
+    "objects",
+    "open_writer",
+    "polylines",
+    "rounded",
+    "uninterrupted",
+]
 
 WRITERS: Final[dict[str, str]] = {
     "json": "trilitenet.formats.writers.native:JsonWriter",
