@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import re
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -90,6 +92,93 @@ def test_it_goes_on_as_if_it_had_never_stopped_and_as_no_other(excited: TrainRes
     train(resume=True, **settings("parts"))
     straight, parts = (read_checkpoint(Path(name) / "last.ckpt")["network"] for name in (excited.folder, "parts"))
     assert all(torch.equal(straight[name], parts[name]) for name in straight)
+
+
+def test_a_decoder_of_ones_own_takes_the_place_of_one(folder: Path) -> None:
+    for tasks, layers in ((("drivable", "lane"), ["lane (Upsampled)"]), (("drivable",), [])):
+        network = build_by("blocks.py:decoded", "tiny", 1, tasks, size=(64, 96))
+        assert foreign_layers(network) == layers
+
+
+def write(folder: Path, name: str, block: str, where: str = "pcaa") -> str:
+    """Write a function that builds a network with a block in it; return its name."""
+    text = "import torch\nfrom torch import nn\nfrom trilitenet import build_network\n"
+    text += f"class Block(nn.Module):\n{textwrap.indent(textwrap.dedent(block), '    ')}\n"
+    text += "def build(*args, **options):\n    network = build_network(*args, **options)\n"
+    (folder / name).write_text(f"{text}    network.{where} = Block()\n    return network\n")
+    return f"{name}:build"
+
+
+FAULTS_IN_TRAINING: dict[str, tuple[str, dict[str, Any], str]] = {
+    "statistics of one value": (
+        """
+        def __init__(self):
+            super().__init__()
+            self.mean = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.BatchNorm2d(64))
+        def forward(self, x):
+            return x + self.mean(x)
+        """,
+        {"batch_size": 1},
+        r"faulty\.py:10: in pcaa\.mean\.1: ValueError: Expected more than 1 value per channel",
+    ),
+    "another size": (
+        """
+        def __init__(self):
+            super().__init__()
+            self.place = nn.Parameter(torch.zeros(64, 8, 16))
+        def forward(self, x):
+            return x + self.place
+        """,
+        {"multi_scale": (2.0, 2.0)},
+        r"faulty\.py:10: in pcaa: RuntimeError: The size of tensor a \(32\)",  # but not that of the run
+    ),
+    "changed in place": (
+        """
+        def forward(self, x):
+            y = x.sigmoid()
+            return y.mul_(2)
+        """,
+        {},
+        r"^faulty\.py:build: in the backward pass: RuntimeError: one of the variables",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", FAULTS_IN_TRAINING)
+def test_what_a_network_raises_in_training_is_one_line(folder: Path, tmp_path: Path, what: str) -> None:
+    block, more, message = FAULTS_IN_TRAINING[what]
+    with pytest.raises(ConfigError, match=message) as caught:
+        train(**settings(str(tmp_path), network=write(folder, "faulty.py", block), **more))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_part_of_ones_own_is_frozen_as_its_function_gives_it_but_not_at_random(folder: Path, tmp_path: Path) -> None:
+    block = """
+    def __init__(self):
+        super().__init__()
+        self.learnt = nn.Conv2d(64, 64, 1)
+    def forward(self, x):
+        return x + self.learnt(x)
+    """
+    options = settings(str(tmp_path), network=write(folder, "own_pcaa.py", block), freeze=("pcaa",), max_steps=1)
+    with pytest.raises(ConfigError, match=r"--freeze pcaa: 2 of its 2 tensors .* \(learnt\.weight, learnt\.bias\)"):
+        train(**options)
+    text = (folder / "own_pcaa.py").read_text()
+    loaded = "    for parameter in network.pcaa.parameters():\n        nn.init.constant_(parameter, 0.01)\n"
+    (folder / "own_pcaa.py").write_text(text.replace("    return network", f"{loaded}    return network"))
+    assert train(**options).finished
+
+
+def test_a_function_itself_is_refused_by_the_name_to_give(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(folder))
+    write(folder, "imported_blocks.py", "def forward(self, x):\n    return x\n")
+    build = importlib.import_module("imported_blocks").build
+    with pytest.raises(ConfigError, match=r"^network takes a name here, .*: 'imported_blocks\.py:build'$"):
+        train(**settings(str(tmp_path), network=build))
+    with pytest.raises(ConfigError, match=r"^network takes a name here, .*: 'FILE\.py:FUNCTION'$"):
+        train(**settings(str(tmp_path), network=lambda *args, **options: build(*args, **options)))
 
 
 def test_it_is_what_another_run_starts_from_and_learns_from(excited: TrainResult) -> None:

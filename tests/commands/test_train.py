@@ -347,7 +347,7 @@ def test_a_tracking_server_that_fails_ends_no_run_and_goes_on_with_it_later(
 
 
 def test_going_on_with_other_frozen_parts_is_refused(scenes: Path, tmp_path: Path) -> None:
-    train(**settings(scenes, tmp_path, max_steps=1, freeze=("drivable",)))
+    train(**settings(scenes, tmp_path, max_steps=1, init="tiny", freeze=("drivable",)))
     with pytest.raises(WeightsError, match=r"was trained with freeze \['drivable'\], this run has \['lane'\]"):
         train(**settings(scenes, tmp_path, max_steps=2, freeze=("lane",)), resume=True)
 
@@ -708,6 +708,24 @@ def test_transfer_freeze_and_distil(scenes: Path, tmp_path: Path, capsys: pytest
     for name, tensor in ours.encoder.state_dict().items():
         torch.testing.assert_close(tensor, theirs.encoder.state_dict()[name], rtol=0, atol=1e-6)
     assert read_card(second.weights).provenance["teacher"] == "final.safetensors"
+
+
+def test_what_begins_at_random_is_not_frozen(scenes: Path, tmp_path: Path) -> None:
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text("freeze: [encoder]\n")
+    with pytest.raises(ConfigError, match=r"--freeze encoder: .* give weights that have them with --init"):
+        train(recipe, **settings(scenes, tmp_path / "run"))
+    frozen = settings(scenes, tmp_path / "run", init="tiny", max_steps=1)
+    assert train(recipe, **frozen).finished
+    frozen |= {"init": None, "max_steps": 2}
+    assert train(recipe, **frozen, resume=True).steps == 2
+
+
+def test_freezing_draws_no_random_numbers(scenes: Path, made: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
+    made(**settings(scenes, tmp_path, init="tiny"))
+    after = torch.rand(1)
+    made(**settings(scenes, tmp_path, init="tiny", freeze=("encoder",)))
+    assert torch.equal(torch.rand(1), after)
 
 
 def save_labels(folder: Path, dataset: DrivingDataset, tasks: Sequence[Task] = TASKS) -> Path:
@@ -1401,7 +1419,7 @@ def test_what_a_recipe_says_reaches_the_parts_of_a_run(
     more: dict[str, Any] = {
         "accumulate": 2, "seed": 7, "samples_per_epoch": 9, "workers": 3, "anchors": own, "pcaa": False,
         "freeze": ("lane",), "classes": ("car", "bus"), "sampling": {"timeofday": {"night": 2.0, "daytime": 0.5}},
-        "val_split": "val",
+        "val_split": "val", "init": "tiny",
     }  # fmt: skip
     parts = made(tmp_path / "own.yaml", **settings(scenes, tmp_path / "run", **more))
     given = {
@@ -1414,7 +1432,7 @@ def test_what_a_recipe_says_reaches_the_parts_of_a_run(
     network, card = parts["network"], parts["card"]
     assert (card.blocks, card.class_names, card.input_size) == (("litepan", "spp"), ("car", "bus"), (64, 128))
     torch.testing.assert_close(network.anchors, torch.tensor(own))
-    assert card.provenance == {"recipe": "own.yaml", "seed": "7"}
+    assert card.provenance == {"recipe": "own.yaml", "seed": "7", "initial weights": "tiny"}
     assert card.training_data == (f"{scenes.name} (train): 10 images",)
     assert {parameter.requires_grad for parameter in network.lane.parameters()} == {False}
     assert all(parameter.requires_grad for parameter in network.encoder.parameters())

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from trilitenet.engine.transfer import freeze, initialise, keep_frozen, order_classes
+from trilitenet.engine.transfer import check_frozen, freeze, initialise, keep_frozen, order_classes
 from trilitenet.errors import ConfigError
 from trilitenet.models.trilitenet import build_network
 
@@ -67,6 +67,18 @@ def test_frozen_parts_learn_nothing() -> None:
         assert all(parameter.grad is None and not parameter.requires_grad for parameter in parameters)
     assert all(parameter.grad is not None for parameter in network.get_submodule("drivable").parameters())
     torch.testing.assert_close(network.encoder.state_dict(), before)
+
+
+def test_what_begins_at_random_cannot_be_frozen() -> None:
+    network, other = build_network("tiny"), build_network("tiny")
+    with pytest.raises(ConfigError, match=r"^--freeze encoder: \d+ of its \d+ tensors would .* random \(level1\.conv"):
+        check_frozen(network, other, ("lane.up1.up.act", "encoder"))  # slopes are no chance
+    source = build_network("tiny", tasks=("drivable",))
+    for one in (network, other):
+        initialise(one, source)
+    check_frozen(network, other, ("encoder.level3", "drivable"))
+    with pytest.raises(ConfigError, match=r"^--freeze encoder: \d of its \d+ tensors .* \(c4\.conv.* leave the part"):
+        check_frozen(network, other, ("drivable", "encoder"))  # without detection there is no C4
 
 
 def test_an_unknown_part_is_named() -> None:

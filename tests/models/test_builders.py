@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 from trilitenet.config import TASKS
 from trilitenet.errors import ConfigError, WeightsError
 from trilitenet.models.blocks import DepthwiseESP
-from trilitenet.models.builders import build_by, name_of
+from trilitenet.models.builders import build_by, name_of, telling
 from trilitenet.models.trilitenet import TriLiteNet, build_network
 from trilitenet.models.weights import load_network, read_builder, read_card, save_network
 
@@ -47,7 +48,7 @@ def write(folder: Path, text: str, name: str = "blocks.py") -> str:
 
 
 def build(reference: str, classes: int = 1, tasks: tuple[str, ...] = TASKS) -> TriLiteNet:
-    return build_by(reference, "tiny", classes, tasks, pcaa=True, litepan=True, spp=True, anchors=None)
+    return build_by(reference, "tiny", classes, tasks, size=(64, 96), pcaa=True, litepan=True, spp=True, anchors=None)
 
 
 def test_without_a_function_it_is_the_network_of_the_paper() -> None:
@@ -118,17 +119,30 @@ FAULTS = {
     "a variant that there is not": ("def build(*args, **options):\n    return build_network('huge')\n", "'huge'"),
     "channels that do not fit": (
         RETURNS + "    network.spp = nn.Conv2d(5, 64, 1)\n    return network\n",
-        "RuntimeError: .*expected input.* to have 5 channels",
+        r"blocks\.py:build: in spp: RuntimeError: .*expected input.* to have 5 channels",
+    ),
+    "channels within a part": (
+        RETURNS + "    network.pcaa = nn.Sequential(nn.Identity(), nn.Conv2d(7, 64, 1))\n    return network\n",
+        r"blocks\.py:build: in pcaa\.1: RuntimeError: ",
+    ),
+    "called with more than it takes": (
+        RETURNS + "    network.lane = nn.Sequential(nn.Identity())\n    return network\n",
+        r"blocks\.py:build: in lane: TypeError: .*takes 2 positional arguments but 4 were given",
+    ),
+    "rows taken for columns": (
+        "class Block(nn.Module):\n    def forward(self, x):\n        b, c, h, w = x.shape\n"
+        "        return x.reshape(b, c, w, h) + x\n" + RETURNS + "    network.pcaa = Block()\n    return network\n",
+        r"blocks\.py:6: in pcaa: RuntimeError: The size of tensor",
     ),
     "in its block": (
         "class Block(nn.Module):\n    def forward(self, x):\n        return x.absent\n"
         + RETURNS
         + "    network.spp = Block()\n    return network\n",
-        r"blocks\.py:5: AttributeError: 'Tensor' object has no attribute 'absent'",
+        r"blocks\.py:5: in spp: AttributeError: 'Tensor' object has no attribute 'absent'",
     ),
     "another size": (
         RETURNS + "    network.drivable.out = nn.Identity()\n    return network\n",
-        r"drivable of a 64x64 image has the shape \(1, 4, 32, 32\), must be \(1, 2, 64, 64\)",
+        r"drivable of a 96x64 image has the shape \(1, 4, 32, 48\), must be \(1, 2, 64, 96\)",
     ),
     "another kind of outputs": (
         "class Net(__import__('trilitenet').models.trilitenet.TriLiteNet):\n"
@@ -156,6 +170,44 @@ def test_what_is_wrong_with_the_code_is_one_line_with_its_place(tmp_path: Path, 
     with pytest.raises(ConfigError, match=message) as caught:
         build(write(tmp_path, text))
     assert "\n" not in str(caught.value)
+
+
+class Placed(nn.Module):
+    """A block that fits one size of image alone."""
+
+    def __init__(self, channels: int, height: int, width: int) -> None:
+        super().__init__()
+        self.place = nn.Parameter(torch.zeros(1, channels, height, width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Apply the block."""
+        return x + self.place
+
+
+def placed(*args: Any, **options: Any) -> TriLiteNet:
+    network = build_network(*args, **options)
+    network.pcaa = Placed(64, 8, 16)  # type: ignore[assignment]
+    return network
+
+
+def test_a_network_is_tried_at_the_size_that_it_is_for(saved: Callable[[TriLiteNet], Path]) -> None:
+    network = build_by(placed, "tiny", 1, ("lane",), size=(64, 128))
+    network.card = dataclasses.replace(network.card, input_size=(64, 128))
+    assert load_network(saved(network), placed).card.input_size == (64, 128)
+    with pytest.raises(ConfigError, match="in pcaa: RuntimeError: The size of tensor"):
+        build_by(placed, "tiny", 1, ("lane",))  # at that of its card
+
+
+def test_what_a_running_network_raises_is_told_and_what_other_code_raises_is_left() -> None:
+    network = build_by(placed, "tiny", 1, ("lane",), size=(64, 128)).train()
+    told = r"test_builders\.py:\d+: in pcaa: RuntimeError: The size"
+    with pytest.raises(ConfigError, match=told), telling("blocks.py:build", running=True):
+        network(torch.zeros(2, 3, 128, 128))
+    ordinary = build_network("tiny", tasks=("lane",))
+    ordinary.pcaa = Placed(64, 8, 16)  # type: ignore[assignment]
+    for wrong in (lambda: ordinary(torch.zeros(1, 3, 64, 64)), lambda: torch.zeros(2) + torch.zeros(3)):
+        with pytest.raises(RuntimeError, match="The size of tensor"), telling("blocks.py:build", running=True):
+            wrong()
 
 
 @pytest.fixture

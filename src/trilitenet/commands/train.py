@@ -53,7 +53,7 @@ from trilitenet.engine.recipe import TrainConfig, merge, read_recipe
 from trilitenet.engine.results import write_results
 from trilitenet.engine.runtime import follow, running_fabric
 from trilitenet.engine.train import CHECKPOINT_NAME, Trainer, TrainResult, figures_in_words, holds_run
-from trilitenet.engine.transfer import freeze, initialise, order_classes
+from trilitenet.engine.transfer import check_frozen, freeze, initialise, order_classes
 from trilitenet.errors import ConfigError, DataError, OutputError, TriLiteNetError, few, import_extra
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.torch_backend import TorchBackend
@@ -61,7 +61,7 @@ from trilitenet.losses.detection import DetectionLoss
 from trilitenet.losses.distillation import DistillationLoss
 from trilitenet.losses.multitask import MultiTaskLoss
 from trilitenet.losses.segmentation import SegmentationLoss
-from trilitenet.models.builders import build_by
+from trilitenet.models.builders import build_by, telling
 from trilitenet.models.detection import DetectionHead
 from trilitenet.models.trilitenet import TriLiteNet, foreign_layers
 from trilitenet.models.weights import load_network, read_card
@@ -183,10 +183,11 @@ def _train(config: TrainConfig, fabric: Any, recipe: Path | None, *, resume: boo
             display=display,
         )
         _warn_of_warmup(config, trainer)
-        result = trainer.fit(
-            folder / CHECKPOINT_NAME if resume else None,
-            lambda *begin: build_loggers(config.loggers, folder, config.to_dict(), *begin),
-        )
+        with telling(config.network, running=True) if config.network is not None else contextlib.nullcontext():
+            result = trainer.fit(
+                folder / CHECKPOINT_NAME if resume else None,
+                lambda *begin: build_loggers(config.loggers, folder, config.to_dict(), *begin),
+            )
         if fabric.is_global_zero and result.finished and "csv" in config.loggers:
             predictor = Predictor(TorchBackend(trainer.averaged, device))
             write_results(
@@ -381,22 +382,31 @@ def _network(config: TrainConfig, dataset: SampleSource, display: _Display, *, r
             anchors = fit.anchors
         else:
             display.line("anchors: kept as they are, for there is no labelled box to fit them to")
-    network = build_by(
+    build = functools.partial(
+        build_by,
         config.network,
         config.variant,
         len(dataset.class_names),
         config.tasks,
+        size=config.input_size,
         pcaa=config.pcaa,
         litepan=config.litepan,
         spp=config.spp,
         anchors=anchors,
     )
+    network = build()
     if initial is not None:
         fitted = network.anchors.clone()
         _match_classes(config, initial, dataset.class_names)
         display.line(f"{config.init}: {initialise(network, initial).summary()}")
         if anchors is not None:
             network.anchors.copy_(fitted)
+    if config.freeze and not resume:
+        with torch.random.fork_rng(devices=()):  # a seeded run is the same with frozen parts and without
+            other = build()
+        if initial is not None:
+            initialise(other, initial)
+        check_frozen(network, other, config.freeze)
     freeze(network, config.freeze)
     return network
 
@@ -614,6 +624,16 @@ def _without_paths(value: Any) -> Any:
     return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
+def _name_in_file(function: Callable[..., Any]) -> str:
+    """Return the name by which a function is found in its file; what such a name looks like, where it has none."""
+    name, module = getattr(function, "__qualname__", ""), getattr(function, "__module__", None)
+    file = getattr(sys.modules.get(module or ""), "__file__", None)
+    if file is None or module == "__main__" or not name.isidentifier():  # that would begin the run once more
+        return "FILE.py:FUNCTION"
+    path, here = Path(file), Path.cwd()
+    return f"{path.relative_to(here) if path.is_relative_to(here) else path}:{name}"
+
+
 def _nested(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings as a recipe holds them: ``augmentation__flip`` within ``augmentation``, YAML read, paths as text.
 
@@ -625,6 +645,8 @@ def _nested(fields: Mapping[str, Any]) -> dict[str, Any]:
         kinds = (hints.get(name), *get_args(hints.get(name)))
         if value is None and type(None) not in kinds:
             continue
+        if name == "network" and callable(value):
+            raise ConfigError(f"network takes a name here, which the recipe of the run holds: {_name_in_file(value)!r}")
         value = _without_paths(value)
         if name in _YAML_FLAGS and isinstance(value, str):
             value = parse_yaml(value, f"--{name.replace('__', '.').replace('_', '-')}")

@@ -9,10 +9,10 @@ from typing import Final
 import torch
 from torch import nn
 
-from trilitenet.errors import ConfigError, did_you_mean
+from trilitenet.errors import ConfigError, did_you_mean, few
 from trilitenet.models.detection import DetectionHead
 
-__all__ = ["TransferReport", "freeze", "initialise", "keep_frozen", "order_classes"]
+__all__ = ["TransferReport", "check_frozen", "freeze", "initialise", "keep_frozen", "order_classes"]
 
 
 LEAST_SHARE: Final = 0.25
@@ -86,6 +86,26 @@ def order_classes(head: DetectionHead, names: Sequence[str], wanted: Sequence[st
     for parameter in head.parameters():  # (anchors x (5 + classes), ...) each
         rows = parameter.unflatten(0, (-1, len(order)))
         parameter.copy_(rows[:, order].flatten(0, 1))
+
+
+def check_frozen(network: nn.Module, other: nn.Module, parts: Sequence[str]) -> None:
+    """Refuse to freeze what begins at random: neither taken over from other weights nor set by what built the network.
+
+    Args:
+        network: The network.
+        other: One made in the same way from another random state.
+        parts: Module names, as for `freeze`.
+
+    Raises:
+        ConfigError: If the two differ in one of the parts, or if there is no such part.
+    """
+    for part in parts:
+        ours, theirs = (dict(_part(one, part).named_parameters()) for one in (network, other))
+        if random := [name for name, parameter in ours.items() if not torch.equal(parameter, theirs[name])]:
+            raise ConfigError(
+                f"--freeze {part}: {len(random)} of its {len(ours)} tensors would stay as they begin, at random "
+                f"({few(random)}); give weights that have them with --init, or leave the part out of --freeze"
+            )
 
 
 def freeze(network: nn.Module, parts: Sequence[str]) -> None:

@@ -23,12 +23,12 @@ from trilitenet.config import STRIDES, check_tasks
 from trilitenet.errors import ConfigError, TriLiteNetError, did_you_mean, gist
 from trilitenet.models.trilitenet import NetworkOutputs, TriLiteNet, build_network
 
-__all__ = ["Builder", "build_by", "name_of"]
+__all__ = ["Builder", "build_by", "name_of", "telling"]
 
 Builder: TypeAlias = "str | Callable[..., TriLiteNet]"
 """A function that builds a network, or its name: ``"FILE.py:FUNCTION"`` or ``"MODULE:FUNCTION"``."""
-_SIDE: Final = 64
-"""Pixels of the image that a network is tried with."""
+_OTHERS: Final = (str(Path(__file__).parents[1]), str(Path(torch.__file__).parent), "<frozen importlib")
+"""Where code lies that is not the user's: what its path begins with."""
 
 
 def name_of(builder: Builder) -> str:
@@ -43,6 +43,8 @@ def build_by(
     variant: str,
     classes: int,
     tasks: Sequence[str],
+    *,
+    size: tuple[int, int] | None = None,
     **options: Any,
 ) -> TriLiteNet:
     """Build a network by a function of one's own, and check that it is one.
@@ -52,6 +54,7 @@ def build_by(
         variant: As `build_network` takes it, and so the rest.
         classes: Number of detection classes.
         tasks: The tasks.
+        size: (height, width) in pixels of the image that it is tried with; that of the network's card if left out.
         **options: ``pcaa``, ``litepan``, ``spp`` and ``anchors``.
 
     Returns:
@@ -65,7 +68,7 @@ def build_by(
         return build_network(variant, classes, tasks, **options)
     name = name_of(builder)
     function = _find(builder) if isinstance(builder, str) else builder
-    with _telling(name):
+    with telling(name):
         network = function(variant, classes, tasks, **options)
     if not isinstance(network, TriLiteNet):
         raise ConfigError(f"{name}: returned {type(network).__name__}, not a TriLiteNet; begin with build_network")
@@ -75,23 +78,23 @@ def build_by(
             f"{name}: built {network.classes} classes and {', '.join(network.tasks)}, asked for were {classes} and "
             f"{', '.join(tasks)}; hand on what it is called with"
         )
-    with _telling(name):
-        _try(network, name)
     network.built_by = name
+    with telling(name):
+        _try(network, name, *(size or network.card.input_size))
     return network
 
 
 @torch.no_grad()
-def _try(network: TriLiteNet, name: str) -> None:
+def _try(network: TriLiteNet, name: str, height: int, width: int) -> None:
     """Run a network once, so that what does not fit together is told before there is any work to lose."""
     training = network.training
     with torch.random.fork_rng(devices=()):
-        outputs = network.eval()(torch.zeros(1, 3, _SIDE, _SIDE))
+        outputs = network.eval()(torch.zeros(1, 3, height, width))
     network.train(training)
-    levels = tuple((1, 3, _SIDE // stride, _SIDE // stride, 5 + network.classes) for stride in STRIDES)
+    levels = tuple((1, 3, height // stride, width // stride, 5 + network.classes) for stride in STRIDES)
     wanted = {
         "detection": levels if "detection" in network.tasks else None,
-        **{task: (1, 2, _SIDE, _SIDE) if task in network.tasks else None for task in ("drivable", "lane")},
+        **{task: (1, 2, height, width) if task in network.tasks else None for task in ("drivable", "lane")},
     }
     if not isinstance(outputs, NetworkOutputs):
         raise ConfigError(f"{name}: the network returns {type(outputs).__name__}, not NetworkOutputs")
@@ -100,7 +103,7 @@ def _try(network: TriLiteNet, name: str) -> None:
         if found is not None:
             found = tuple(tuple(level.shape) for level in found) if task == "detection" else tuple(found.shape)
         if found != shape:
-            raise ConfigError(f"{name}: {task} of a {_SIDE}x{_SIDE} image has the shape {found}, must be {shape}")
+            raise ConfigError(f"{name}: {task} of a {width}x{height} image has the shape {found}, must be {shape}")
 
 
 def _find(name: str) -> Callable[..., TriLiteNet]:
@@ -116,7 +119,7 @@ def _find(name: str) -> Callable[..., TriLiteNet]:
 
 
 def _import(place: str, name: str) -> ModuleType:
-    with _telling(name):
+    with telling(name):
         try:
             return importlib.import_module(place)
         except ModuleNotFoundError as error:
@@ -139,7 +142,7 @@ def _run(path: Path, name: str) -> ModuleType:
     beside = str(path.parent.resolve())
     sys.path.insert(0, beside)
     try:
-        with _telling(name):
+        with telling(name):
             spec.loader.exec_module(module)
     finally:
         sys.path.remove(beside)
@@ -147,18 +150,47 @@ def _run(path: Path, name: str) -> ModuleType:
 
 
 @contextlib.contextmanager
-def _telling(name: str) -> Iterator[None]:
-    """Tell what somebody's code raises in one line: where, and what."""
+def telling(name: str, *, running: bool = False) -> Iterator[None]:
+    """Tell what somebody's code raises in one line: where, in which part of the network, and what.
+
+    Args:
+        name: Of the function that builds the network.
+        running: Whether other code runs as well, as in training: only errors that come out of the network, or out of
+            its backward pass, are told so.
+
+    Raises:
+        ConfigError: For any error but those of this package.
+    """
     try:
         yield
     except TriLiteNetError:
         raise
     except Exception as error:
-        # Of the lines that led there the last which is neither this package's nor PyTorch's.
-        if isinstance(error, SyntaxError):
-            where = f"{error.filename}:{error.lineno}"
-        else:
-            own = (str(Path(__file__).parents[1]), str(Path(torch.__file__).parent), "<frozen importlib")
-            lines = [each for each in traceback.extract_tb(error.__traceback__) if not each.filename.startswith(own)]
-            where = f"{lines[-1].filename}:{lines[-1].lineno}" if lines else name
-        raise ConfigError(f"{where}: {type(error).__name__}: {gist(error)}") from error
+        place, part = _origin(error, name)
+        if running and part is None:
+            raise
+        within = f" in {part}:" if part else ""
+        raise ConfigError(f"{place}:{within} {type(error).__name__}: {gist(error)}") from error
+
+
+def _origin(error: Exception, name: str) -> tuple[str, str | None]:
+    """Return the last line of somebody's code that led to an error, and in which part of a network of theirs it came.
+
+    Returns:
+        ``FILE:LINE``, or ``name`` if no such line led there; and the part's name, ``""`` for the network itself, None
+        if the error came from elsewhere.
+    """
+    if isinstance(error, SyntaxError):
+        return f"{error.filename}:{error.lineno}", None
+    place, part = name, None
+    parts: dict[int, str] = {}
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        this, code = frame.f_locals.get("self"), frame.f_code
+        if not parts and isinstance(this, TriLiteNet) and this.built_by is not None:
+            place, parts = name, {id(module): path for path, module in this.named_modules()}
+        elif code is torch.autograd.backward.__code__:
+            place, part = name, "the backward pass"
+        part = parts.get(id(this), part)
+        if not code.co_filename.startswith(_OTHERS):
+            place = f"{code.co_filename}:{line}"
+    return place, part

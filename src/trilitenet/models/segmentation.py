@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from trilitenet.models.blocks import ConvBNPReLU, TransposedConvBNPReLU
 
-__all__ = ["SegmentationHead"]
+__all__ = ["SegmentationHead", "UpStage"]
 
 
 class UpStage(nn.Module):
@@ -35,6 +35,12 @@ class SegmentationHead(nn.Module):
         self.out = TransposedConvBNPReLU(c0, 2)
 
     def forward(self, x: Tensor, i1: Tensor, i2: Tensor) -> Tensor:
-        """Apply the head."""
+        """Return logits (B, 2, H, W).
+
+        Args:
+            x: F_pcaa, (B, c2, H/8, W/8).
+            i1: The image pooled once, (B, 3, H/2, W/2).
+            i2: The image pooled twice, (B, 3, H/4, W/4).
+        """
         out: Tensor = self.out(self.up2(self.up1(x, i2), i1))
         return out

@@ -240,7 +240,9 @@ def load_network(path: str | os.PathLike[str], network: Builder | None = None) -
         )
     blocks = {name: name in card.blocks for name in ("pcaa", "litepan", "spp")}
     with torch.random.fork_rng(devices=()):  # the random weights that are replaced take nothing from a seeded run
-        built = build_by(network, card.variant, card.classes, card.tasks, anchors=card.anchors, **blocks)
+        built = build_by(
+            network, card.variant, card.classes, card.tasks, size=card.input_size, anchors=card.anchors, **blocks
+        )
     if network is not None and (found := ", ".join(foreign_layers(built))) != layers:
         ordinary = "no layers but those of build_network"
         raise WeightsError(
