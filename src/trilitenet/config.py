@@ -256,7 +256,7 @@ ARTEFACT_KEY: Final = "trilitenet.artefact"
 WEIGHTS_HASH_KEY: Final = "trilitenet.weights_sha256"
 """Key of the SHA-256 of an artefact's weights, where these and the metadata are files of their own."""
 GRAPH_HASH_KEY: Final = "trilitenet.graph_sha256"
-"""Key of the SHA-256 of an artefact's graph, where that and the metadata are files of their own."""
+"""Key of the SHA-256 of an artefact's graph: of NCNN's file of it, an engine, or all that stands before the hash."""
 ARTEFACT_SCHEMA: Final = 1
 """Version of the artefact's description; a file with a higher one is refused."""
 ARTEFACT_SUFFIXES: Final = {

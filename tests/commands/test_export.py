@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import errno
 import importlib.metadata
+import json
 import math
 import os
 import pickle
@@ -23,7 +24,7 @@ from tests.fakes import ColourBackend
 from trilitenet.commands import export as command
 from trilitenet.commands.export import export, find_pictures
 from trilitenet.commands.progress import ProgressBar
-from trilitenet.config import TASKS, ArtefactInfo, Thresholds
+from trilitenet.config import ARTEFACT_KEY, TASKS, ArtefactInfo, Thresholds
 from trilitenet.data.reading import DrivingDataset
 from trilitenet.data.synthetic_files import write_dataset
 from trilitenet.deploy.onnx import build_onnx
@@ -33,6 +34,7 @@ from trilitenet.engine.evaluate import evaluate
 from trilitenet.engine.figures import FIGURES
 from trilitenet.engine.report import Figure, Report
 from trilitenet.errors import BackendError, ConfigError, InputError, OutputError, ShapeError
+from trilitenet.inference.exported import read_onnx_metadata
 from trilitenet.inference.exported_torch_backend import ExportedTorchBackend
 from trilitenet.inference.onnx_backend import OnnxBackend
 from trilitenet.inference.openvino_backend import openvino_core
@@ -428,7 +430,11 @@ def test_tensorrt_without_tensorrt_says_how(artefacts: Artefacts, tmp_path: Path
     assert "no engine was built" in done.summary()
     assert "trtexec --onnx=" in done.summary()
     assert " --fp16 " in done.summary()
-    assert trilitenet.load(done.path).backend.canvas == (64, 128)
+    assert "trilitenet[tensorrt] runs a.plan on TensorRT 10, with a.onnx beside it" in done.summary()
+    backend = trilitenet.load(done.path, backend="onnxruntime").backend
+    assert backend.canvas == (64, 128)
+    assert backend.name == "onnxruntime cpu fp32"
+    assert json.loads(read_onnx_metadata(done.path)[ARTEFACT_KEY])["format"] == "onnx"
 
 
 @pytest.mark.parametrize("precision", ["fp32", "fp16"])

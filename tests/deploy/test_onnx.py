@@ -13,7 +13,7 @@ import torch
 
 from tests.artefacts import SIZE, Artefacts
 from tests.deploy.networks import lively_network
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, Thresholds
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, GRAPH_HASH_KEY, ArtefactInfo, Thresholds
 from trilitenet.deploy import onnx as deploy_onnx
 from trilitenet.deploy.graph import DeployGraph
 from trilitenet.deploy.layouts import LAYOUTS, pick_layout
@@ -34,7 +34,7 @@ def test_a_program_that_is_not_ours_accepts_it(artefacts: Artefacts) -> None:
     model = onnx.load(str(artefacts.folder / "model.onnx"))
     onnx.checker.check_model(model, full_check=True)
     assert [value.name for value in model.graph.output] == ["detection", "drivable", "lane"]
-    assert {entry.key for entry in model.metadata_props} == {CARD_KEY, ARTEFACT_KEY}
+    assert [entry.key for entry in model.metadata_props] == [CARD_KEY, ARTEFACT_KEY, GRAPH_HASH_KEY]
     names = [node.name for node in model.graph.node]
     assert len(set(names)) == len(names)
     assert any(name.startswith("lane/up2/conv1/Conv") for name in names)

@@ -20,7 +20,7 @@ import trilitenet
 from tests.artefacts import SIZE, Artefacts, check_backend
 from tests.deploy.networks import lively_network
 from trilitenet.commands.export import export
-from trilitenet.config import ArtefactInfo
+from trilitenet.config import GRAPH_HASH_KEY, ArtefactInfo
 from trilitenet.data.synthetic import SyntheticScenes
 from trilitenet.deploy.executorch import _folded, _quantised, build_executorch
 from trilitenet.deploy.graph import DeployGraph, Traceable
@@ -98,6 +98,26 @@ def test_a_file_that_is_cut_short_is_one_line(program: Path, tmp_path: Path, kee
     with pytest.raises(WeightsError, match=r"broken\.pte: not a usable ExecuTorch program") as caught:
         ExecuTorchBackend(broken)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("start", "end"), [(0.3, 0.31), (0.3, 0.5), (0.8, 1.0)])
+def test_a_program_with_a_hole_is_one_line(program: Path, tmp_path: Path, start: float, end: float) -> None:
+    content = bytearray(program.read_bytes())
+    hole = slice(int(start * len(content)), int(end * len(content)))
+    content[hole] = bytes(len(content[hole]))
+    (tmp_path / "broken.pte").write_bytes(content)
+    with pytest.raises(WeightsError, match=r"broken\.pte: not a usable ExecuTorch program \(damaged"):
+        ExecuTorchBackend(tmp_path / "broken.pte")
+
+
+def test_a_program_without_a_hash_is_an_older_one(artefacts: Artefacts, program: Path, tmp_path: Path) -> None:
+    key = GRAPH_HASH_KEY.encode()
+    content, _, _ = program.read_bytes().rpartition(b"\n" + key)
+    (tmp_path / "cut.pte").write_bytes(content)
+    with pytest.raises(WeightsError, match=r"cut\.pte: not a usable ExecuTorch program"):
+        ExecuTorchBackend(tmp_path / "cut.pte")
+    (tmp_path / "older.pte").write_bytes(content.replace(key, b"x" * len(key)))  # the method that says there is one
+    check_backend(ExecuTorchBackend(tmp_path / "older.pte"), artefacts)
 
 
 def test_a_damaged_card_is_one_line(program: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import ctypes
 import dataclasses
 import json
 import os
@@ -11,6 +12,7 @@ import re
 import shutil
 import subprocess
 import sys
+import types
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -22,13 +24,21 @@ from numpy.typing import NDArray
 
 import trilitenet
 from tests.artefacts import SIZE, Artefacts, check_backend
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, GRAPH_HASH_KEY, ArtefactInfo, ModelCard
+from trilitenet.deploy.onnx import save_onnx
 from trilitenet.errors import BackendError, ConfigError, ShapeError, WeightsError
-from trilitenet.inference.exported import ArtefactBackend, gather_outputs, is_int8_onnx, prepare_input, read_metadata
+from trilitenet.inference.exported import (
+    ArtefactBackend,
+    gather_outputs,
+    is_int8_onnx,
+    prepare_input,
+    read_metadata,
+    read_onnx_metadata,
+)
 from trilitenet.inference.ncnn_backend import NcnnBackend
 from trilitenet.inference.onnx_backend import OnnxBackend
 from trilitenet.inference.openvino_backend import OpenVINOBackend
-from trilitenet.inference.tensorrt_backend import MAGIC, pack_engine, unpack_engine
+from trilitenet.inference.tensorrt_backend import MAGIC, TensorRTBackend, pack_engine, unpack_engine
 
 BACKENDS = [
     pytest.param("model.onnx", OnnxBackend, {}, 0.9999, 0.01, id="onnxruntime"),
@@ -405,7 +415,7 @@ def test_corrupt_and_missing_files_are_one_line(tmp_path: Path, name: str, kind:
 def test_foreign_and_newer_artefacts_are_refused(artefacts: Artefacts, tmp_path: Path, kind: Any) -> None:
     onnx = pytest.importorskip("onnx")
     model = onnx.load(str(artefacts.folder / "model.onnx"))
-    metadata = {entry.key: entry.value for entry in model.metadata_props}
+    metadata = {entry.key: entry.value for entry in model.metadata_props if entry.key != GRAPH_HASH_KEY}
 
     def with_metadata(entries: dict[str, str]) -> Path:
         del model.metadata_props[:]
@@ -445,7 +455,7 @@ def test_a_graph_other_than_its_metadata_is_refused(
         helper.make_graph(nodes, "g", takes, gives), ir_version=8, opset_imports=[helper.make_opsetid("", 17)]
     )
     metadata = onnx.load(str(artefacts.folder / "model.onnx")).metadata_props
-    helper.set_model_props(model, {entry.key: entry.value for entry in metadata})
+    helper.set_model_props(model, {entry.key: entry.value for entry in metadata if entry.key != GRAPH_HASH_KEY})
     onnx.save(model, str(tmp_path / "foreign.onnx"))
     with pytest.raises(WeightsError, match=re.escape(message)):
         kind(tmp_path / "foreign.onnx")
@@ -494,6 +504,66 @@ def test_a_graph_that_was_cut_off_is_told_in_our_words(
     with pytest.raises(WeightsError, match="ONNX model"):
         kind(path)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("kind", [OnnxBackend, OpenVINOBackend])
+@pytest.mark.parametrize(("start", "end"), [(0.3, 0.31), (0.3, 0.9), (0.6, 1.0)])
+def test_a_graph_with_a_hole_is_told(artefacts: Artefacts, tmp_path: Path, kind: Any, start: float, end: float) -> None:
+    content = bytearray((artefacts.folder / "model.onnx").read_bytes())
+    hole = slice(int(start * len(content)), int(end * len(content)))
+    content[hole] = bytes(len(content[hole]))
+    (tmp_path / "a.onnx").write_bytes(content)
+    with pytest.raises(WeightsError, match=r"a\.onnx: .*damaged.*export it again"):
+        kind(tmp_path / "a.onnx")
+
+
+@pytest.mark.parametrize("kind", [OnnxBackend, OpenVINOBackend])
+def test_a_graph_that_another_program_changed_is_told_and_may_go_without_its_hash(
+    artefacts: Artefacts, tmp_path: Path, kind: Any
+) -> None:
+    onnx = pytest.importorskip("onnx")
+    model, path = onnx.load(str(artefacts.folder / "model.onnx")), tmp_path / "a.onnx"
+    model.metadata_props.add(key="author", value="someone")
+    onnx.save(model, str(path))
+    kind(path).close()
+    model.graph.doc_string = "changed"
+    onnx.save(model, str(path))
+    with pytest.raises(WeightsError, match=rf"changed by another program .* take '{GRAPH_HASH_KEY}' out of its metad"):
+        kind(path)
+    entries = {entry.key: entry.value for entry in model.metadata_props if entry.key != GRAPH_HASH_KEY}
+    onnx.helper.set_model_props(model, entries)
+    onnx.save(model, str(path))
+    kind(path).close()
+
+
+def test_metadata_of_a_graph_are_read_without_a_runtime(artefacts: Artefacts, tmp_path: Path) -> None:
+    path = artefacts.folder / "model.onnx"
+    metadata = read_onnx_metadata(path)
+    assert list(metadata) == [CARD_KEY, ARTEFACT_KEY, GRAPH_HASH_KEY]
+    backend = OnnxBackend(path)
+    assert read_metadata(metadata, "") == (backend.card, backend.info)
+    whole = path.read_bytes()
+    for content in (whole[:-1], whole[: len(whole) // 2], whole[:3], b"not a model\n" * 20, b"\x72\x02\x0a\x00"):
+        (tmp_path / "a.onnx").write_bytes(content)
+        with pytest.raises(WeightsError, match=r"not a usable ONNX model \(cut off or damaged; export it again\)$"):
+            read_onnx_metadata(tmp_path / "a.onnx")
+
+
+def test_a_program_with_a_wrong_bit_is_told(tmp_path: Path) -> None:
+    import torch
+
+    from trilitenet.inference.exported_torch_backend import ExportedTorchBackend
+
+    card, info = ModelCard("tiny"), ArtefactInfo("torch", size=SIZE)
+    path, module = tmp_path / "a.pt2", torch.nn.Linear(8, 8)
+    metadata = {CARD_KEY: card.to_json(), ARTEFACT_KEY: info.to_json()}
+    torch.export.save(torch.export.export(module, (torch.ones(1, 8),)), path, extra_files=metadata)
+    ExportedTorchBackend(path).close()
+    content, weights = bytearray(path.read_bytes()), module.weight.detach().numpy().tobytes()
+    content[content.index(weights)] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(WeightsError, match=r"a\.pt2: not a usable PyTorch program \(damaged"):
+        ExportedTorchBackend(path)
 
 
 def test_broken_programs_print_nothing_of_their_own(tmp_path: Path) -> None:
@@ -629,6 +699,14 @@ def test_engine_files(tmp_path: Path) -> None:
     path = tmp_path / "a.engine"
     path.write_bytes(pack_engine(b"engine", card, info))
     assert unpack_engine(path) == (card, info, b"engine")
+    whole = path.read_bytes()
+    path.write_bytes(whole.replace(b"engine", b"\0ngine"))
+    assert path.read_bytes() == whole[:-6] + b"\0ngine"
+    with pytest.raises(WeightsError, match=r"a\.engine: its engine is damaged; build it again with"):
+        unpack_engine(path)
+    older = json.dumps({CARD_KEY: card.to_json(), ARTEFACT_KEY: info.to_json()}).encode()
+    path.write_bytes(MAGIC + len(older).to_bytes(4, "little") + older + b"engine")
+    assert unpack_engine(path) == (card, info, b"engine")
     for broken in (b"ftrt" * 20, MAGIC, MAGIC + b"\x02"):
         path.write_bytes(broken)
         with pytest.raises(WeightsError, match="not an engine of ours"):
@@ -637,6 +715,105 @@ def test_engine_files(tmp_path: Path) -> None:
         path.write_bytes(MAGIC + b"\x03\0\0\0" + header)
         with pytest.raises(WeightsError, match=message):
             unpack_engine(path)
+
+
+class FakeTensorRT:
+    """TensorRT and CUDA of memory on the host: an engine answers each output with its number among the tensors.
+
+    Args:
+        shapes: The shape of each tensor; ``image`` comes in.
+    """
+
+    ERROR, cudaMemcpyKind = 0, types.SimpleNamespace(cudaMemcpyHostToDevice=1, cudaMemcpyDeviceToHost=2)  # noqa: N815
+
+    def __init__(self, shapes: dict[str, tuple[int, ...]]) -> None:
+        self.shapes, self.num_io_tensors, self.held = shapes, len(shapes), dict[int, NDArray[np.uint8]]()
+        self.addresses: dict[str, int] = {}
+        self.engine = b""
+        self.Logger = self  # called, it is itself
+
+    def __call__(self, _severity: int) -> FakeTensorRT:
+        return self
+
+    def __getattr__(self, name: str) -> Any:
+        """Runtime and context are it as well; other calls of CUDA succeed."""
+        return (lambda *_: (0, 7)) if name.startswith("cuda") else lambda *_: self
+
+    def deserialize_cuda_engine(self, engine: bytes) -> FakeTensorRT:
+        self.engine = engine
+        return self
+
+    def get_tensor_name(self, index: int) -> str:
+        return list(self.shapes)[index]
+
+    def get_tensor_shape(self, name: str) -> tuple[int, ...]:
+        return self.shapes[name]
+
+    def nptype(self, _: object) -> type:
+        return np.float32
+
+    def cudaMalloc(self, size: int) -> tuple[int, int]:  # noqa: N802
+        memory = np.zeros(size, np.uint8)
+        self.held[memory.ctypes.data] = memory
+        return 0, memory.ctypes.data
+
+    def set_tensor_address(self, name: str, address: int) -> None:
+        self.addresses[name] = address
+
+    def cudaMemcpyAsync(self, target: int, source: int, size: int, *_: object) -> int:  # noqa: N802
+        ctypes.memmove(target, source, size)
+        return 0
+
+    def execute_async_v3(self, _stream: object) -> None:
+        for number, name in enumerate(self.shapes):
+            if name != "image":
+                self.held[self.addresses[name]].view(np.float32)[:] = number
+
+
+@pytest.fixture
+def planned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, FakeTensorRT]:
+    """A plan with the portable graph beside it, by its outermost message alone, and what stands in for TensorRT."""
+    onnx = pytest.importorskip("onnx")
+    fake = FakeTensorRT({"image": (1, 3, *SIZE), "drivable": (1, *SIZE), "lane": (1, *SIZE)})
+    monkeypatch.setattr("trilitenet.inference.tensorrt_backend.import_extra", lambda *_: fake)
+    model = onnx.helper.make_model(onnx.helper.make_graph([], "g", [], []))
+    card = ModelCard("tiny", tasks=("drivable", "lane"))
+    info = ArtefactInfo("onnx", size=SIZE, input="float_nchw", masks="logit")
+    onnx.helper.set_model_props(model, {CARD_KEY: card.to_json(), ARTEFACT_KEY: info.to_json()})
+    save_onnx(model, tmp_path / "a.onnx")
+    (tmp_path / "a.plan").write_bytes(b"plan")
+    return tmp_path / "a.plan", fake
+
+
+def test_a_plan_has_its_card_from_the_graph_beside_it(planned: tuple[Path, FakeTensorRT]) -> None:
+    path, fake = planned
+    predictor = trilitenet.load(path)
+    assert fake.engine == b"plan"
+    assert predictor.backend.name == "tensorrt cuda plan"
+    assert predictor.backend.canvas == SIZE
+    raw = predictor.backend.run(np.zeros((2, *SIZE, 3), np.uint8))
+    assert raw.drivable is not None
+    assert raw.drivable.shape == (2, *SIZE)
+    assert raw.drivable.min() == 255
+    predictor.close()
+    with pytest.raises(BackendError, match="the model was closed"):
+        predictor.backend.run(np.zeros((1, *SIZE, 3), np.uint8))
+
+
+def test_a_plan_of_another_graph_or_without_one_is_refused(planned: tuple[Path, FakeTensorRT]) -> None:
+    path, fake = planned
+    fake.shapes["image"] = (1, 3, 96, 128)
+    message = "a.plan: its metadata describe an input of (64, 128), the graph takes [1, 3, 96, 128]"
+    with pytest.raises(WeightsError, match=re.escape(message)):
+        TensorRTBackend(path)
+    fake.shapes |= {"image": (1, 3, *SIZE), "lane": (1, -1, 128)}
+    with pytest.raises(BackendError, match=r"a\.plan: has no fixed sizes; build it from the graph of: export --format"):
+        TensorRTBackend(path)
+    path.with_suffix(".onnx").unlink()
+    with pytest.raises(WeightsError, match=r"a\.plan: its card is missing; keep a\.onnx, which it was built from"):
+        TensorRTBackend(path)
+    with pytest.raises(WeightsError, match=r"b\.plan: no such file"):
+        trilitenet.load(path.with_name("b.plan"))
 
 
 def test_integers_are_told_by_what_the_artefact_says_of_itself(tmp_path: Path) -> None:

@@ -71,6 +71,7 @@ __all__ = [
     "DROP_FRAMES",
     "PRECISIONS",
     "Exported",
+    "check_drop",
     "drop_frames",
     "export",
     "find_pictures",
@@ -281,10 +282,15 @@ def export(
         if calibration is None or precision != "int8":
             return _keep(trained, build(), info, path, checks)
         return _export_int8(trained, build, info, path, checks, calibration, calibration_frames, max_drop)
+    # What TensorRT is built from is a graph in fp32, which calls itself so where it is kept.
+    traced = dataclasses.replace(info, format="onnx", precision="fp32") if format == "tensorrt" else info
     thresholds = trained.card.thresholds if nms else None
-    proto = build_onnx(graph, trained.card, info, nms=thresholds, half=format == "onnx" and precision == "fp16")
+    proto = build_onnx(graph, trained.card, traced, nms=thresholds, half=format == "onnx" and precision == "fp16")
+    if format == "tensorrt" and is_installed():  # pragma: no cover - needs a GPU and TensorRT
+        return _keep(trained, build_engine(proto, precision), info, path, checks)
     if format == "tensorrt":
-        return _export_tensorrt(trained, proto, info, path, checks)
+        exported = _keep(trained, proto, traced, _fallback(path), checks)
+        return dataclasses.replace(exported, notes=_engine_notes(exported.path, path, precision))
     built: Any = build_openvino(proto) if format == "openvino" else proto
     if calibration is None or precision != "int8":
         return _keep(trained, built, info, path, checks)
@@ -637,20 +643,16 @@ def _export_int8(
     raise BackendError(f"{path}: not written, INT8 costs too much even with most layers in floating point ({reason})")
 
 
-def _export_tensorrt(
-    network: TriLiteNet, proto: Any, info: ArtefactInfo, path: Path, checks: Sequence[NDArray[np.uint8]]
-) -> Exported:
-    """Build an engine where TensorRT is; else write the restricted ONNX graph and say how to build it."""
-    if is_installed():  # pragma: no cover - needs a GPU and TensorRT
-        return _keep(network, build_engine(proto, info.precision), info, path, checks)
-    onnx_path = _fallback(path)
-    exported = _keep(network, proto, dataclasses.replace(info, format="onnx", precision="fp32"), onnx_path, checks)
-    notes = (
+def _engine_notes(graph: Path, engine: Path, precision: Precision) -> tuple[str, ...]:
+    """Say how an engine is built from the restricted ONNX graph elsewhere, and what runs it."""
+    plan = engine.with_suffix(".plan")
+    return (
         "TensorRT is not installed here: no engine was built, and none was run.",
         "On the machine that will run it:",
-        f"  {trtexec_line(onnx_path, path.with_suffix('.plan'), info.precision)}",
+        f"  {trtexec_line(graph, plan, precision)}",
+        f"There trilitenet[tensorrt] runs {plan.name} on TensorRT 10, with {graph.name} beside it,",
+        "as do programs of your own on TensorRT's C++ or Python interface, of the version that built it.",
     )
-    return dataclasses.replace(exported, notes=notes)
 
 
 def _fallback(engine: Path) -> Path:

@@ -30,6 +30,7 @@ _RUNS: Final[dict[str, tuple[str, ...]]] = {
     ".param": ("ncnn",),
     ".pte": ("executorch",),
     ".engine": ("tensorrt",),
+    ".plan": ("tensorrt",),
 }
 """Runtimes of a file by its suffix; others run on PyTorch."""
 _EXPORTED: Final = frozenset({*_RUNS, ".pt2"})
@@ -58,7 +59,7 @@ def load(
 
     Args:
         model: Name of shipped weights, a file of weights, or an exported artefact (.onnx, .xml, .param or the folder
-            it is in, .pte, .engine, .pt2).
+            it is in, .pte, .engine, .plan, .pt2).
         network: The function that builds the network of a file of weights, or its name, where that is not
             `build_network`; see `load_network`.
         device: auto (the best there is), cpu, cuda, cuda:1, mps; or a ``torch.device``.

@@ -1,5 +1,7 @@
 """The deploy graph as an ExecuTorch program (``.pte``) for XNNPACK; card and description are methods without inputs.
 
+Its SHA-256 stands after the program, which ExecuTorch leaves unread; a further method says that it must stand there.
+
 The graph is the portable one (float planes of 0 .. 255 in, mask logits out), for one size. Boxes are decoded inside.
 """
 
@@ -7,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import hashlib
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -15,7 +18,7 @@ import torch.fx.config
 import torch.fx.traceback
 from numpy.typing import NDArray
 
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, GRAPH_HASH_KEY, ArtefactInfo, ModelCard
 from trilitenet.deploy.graph import DeployGraph, Traceable
 from trilitenet.deploy.quantize import kept_nodes
 from trilitenet.deploy.quiet import quiet
@@ -60,9 +63,14 @@ def build_executorch(
             lowered = exir.to_edge_transform_and_lower(
                 _folded(program),
                 partitioner=[xnnpack.XnnpackPartitioner()],
-                constant_methods={CARD_KEY: card.to_json(), ARTEFACT_KEY: info.to_json()},
+                constant_methods={
+                    CARD_KEY: card.to_json(),
+                    ARTEFACT_KEY: info.to_json(),
+                    GRAPH_HASH_KEY: "after the program",
+                },
             )
-            return bytes(lowered.to_executorch().buffer)
+            made = bytes(lowered.to_executorch().buffer)
+            return made + f"\n{GRAPH_HASH_KEY} {hashlib.sha256(made).hexdigest()}".encode()
         except Exception as error:  # its passes raise what they like
             raise BackendError(f"ExecuTorch cannot lower the deploy graph ({gist(error)})") from error
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import hashlib
 import os
 import re
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard, Thresholds
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, GRAPH_HASH_KEY, ArtefactInfo, ModelCard, Thresholds
 from trilitenet.deploy.graph import DeployGraph, Traceable
 from trilitenet.deploy.quiet import quiet
 from trilitenet.errors import BackendError, import_extra
@@ -93,8 +94,11 @@ def build_onnx(
 
 
 def save_onnx(model: Any, path: str | os.PathLike[str]) -> None:
-    """Write an ONNX model to one file."""
-    Path(path).write_bytes(model.SerializeToString())
+    """Write an ONNX model to one file, which ends with an entry of metadata: the SHA-256 of all before it."""
+    content = model.SerializeToString()
+    end = type(model)()
+    end.metadata_props.add(key=GRAPH_HASH_KEY, value=hashlib.sha256(content).hexdigest())
+    Path(path).write_bytes(content + end.SerializeToString())  # put together, two messages are one
 
 
 def _reason(error: BaseException) -> str:

@@ -1,7 +1,7 @@
 """TensorRT engines, through its Python API where it is installed; else the exact ``trtexec`` line.
 
-An engine only runs on the kind of GPU it was built on. A file of ours is a JSON header (magic, card, description) of
-stated length, then the serialised engine.
+An engine only runs on the kind of GPU it was built on. A file of ours is a JSON header (card, description, SHA-256 of
+the engine) of stated length behind a magic, then the serialised engine; what ``trtexec`` writes is the engine alone.
 """
 
 from __future__ import annotations

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
 import os
+import re
 import sys
 import threading
 from collections.abc import Iterator, Mapping
@@ -15,13 +17,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, GRAPH_HASH_KEY
 from trilitenet.errors import BackendError, WeightsError, import_extra
 from trilitenet.inference.backend import check_process, held
 from trilitenet.inference.exported import ArtefactBackend, prepare_input, read_metadata
 
 __all__ = ["ExecuTorchBackend"]
 
+_HASH: Final = re.compile(rb"\n" + re.escape(GRAPH_HASH_KEY.encode()) + rb" ([0-9a-f]{64})\Z")
 _SILENCE: Final = threading.Lock()
 """Standard error is one for all threads: two that turn it off and on at once would leave it off."""
 
@@ -53,19 +56,23 @@ class ExecuTorchBackend(ArtefactBackend):
             if threads is not None:
                 runtime._unsafe_reset_threadpool(threads)
             data = self._path.read_bytes()
+            hashed = _HASH.search(data)
+            damaged = f"{self._path}: not a usable ExecuTorch program (damaged, or another file)"
+            if hashed is not None and hashlib.sha256(data[: hashed.start()]).hexdigest() != hashed[1].decode():
+                raise WeightsError(damaged)
             try:
                 program = runtime._load_program_from_buffer(
                     data, program_verification=runtime.Verification.InternalConsistency
                 )
                 methods = {program.get_method_name(index) for index in range(program.num_methods())}
+                if GRAPH_HASH_KEY in methods and hashed is None:  # older programs have neither
+                    raise WeightsError(damaged)
                 found = {key: program.load_method(key)([])[0] for key in (CARD_KEY, ARTEFACT_KEY) if key in methods}
                 self._card, self.info = read_metadata(found, str(self._path))
                 # Kept together, for each borrows memory of the one before without keeping it alive.
                 self._session: Any = data, program, program.load_method("forward")
             except (RuntimeError, UnicodeError) as error:
-                raise WeightsError(
-                    f"{self._path}: not a usable ExecuTorch program (damaged, or another file)"
-                ) from error
+                raise WeightsError(damaged) from error
         self._process = os.getpid()
         self._lock = threading.Lock()
 

@@ -3,23 +3,37 @@
 from __future__ import annotations
 
 import abc
+import hashlib
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY, MAX_STRIDE, ArtefactInfo, ModelCard
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, GRAPH_HASH_KEY, MAX_STRIDE, ArtefactInfo, ModelCard
 from trilitenet.errors import BackendError, ShapeError, TriLiteNetError, WeightsError, gist
 from trilitenet.inference.backend import check_batch
 from trilitenet.structures import RawOutputs
 
-__all__ = ["ArtefactBackend", "check_graph", "gather_outputs", "is_int8_onnx", "prepare_input", "read_metadata"]
+__all__ = [
+    "ArtefactBackend",
+    "check_graph",
+    "gather_outputs",
+    "is_int8_onnx",
+    "prepare_input",
+    "read_metadata",
+    "read_onnx",
+    "read_onnx_metadata",
+]
 
 _METADATA_BYTES = 1 << 16
+_ONNX_METADATA: Final = 14
+"""Number of the field of an ONNX model that holds a key and a value."""
+_HASH: Final = re.compile(rb"\x72.\x0a." + re.escape(GRAPH_HASH_KEY.encode()) + rb"\x12\x40([0-9a-f]{64})", re.DOTALL)
+"""Such a field with the hash, as it stands in the file."""
 
 
 def read_metadata(metadata: Mapping[str, str], source: str) -> tuple[ModelCard, ArtefactInfo]:
@@ -80,6 +94,80 @@ def is_int8_onnx(path: str | os.PathLike[str]) -> bool:
         return False
     start = end.rfind(ARTEFACT_KEY.encode())
     return start >= 0 and re.search(rb'"precision":\s*"int8"', end[start:]) is not None
+
+
+def read_onnx(path: Path) -> bytes:
+    """Return the content of an ``.onnx`` file, if it is what was exported; older files hold no hash of themselves.
+
+    What was added after the hash, such as more metadata, does not count.
+
+    Args:
+        path: The file.
+
+    Raises:
+        WeightsError: If it is not there, damaged or changed.
+    """
+    if not path.is_file():
+        raise WeightsError(f"{path}: no such file")
+    content = path.read_bytes()
+    key = content.rfind(GRAPH_HASH_KEY.encode())
+    hashed = _HASH.match(content, max(0, key - 4))
+    if hashed is not None and hashlib.sha256(content[: hashed.start()]).hexdigest() != hashed[1].decode():
+        raise WeightsError(
+            f"{path}: damaged, or changed by another program since it was exported; export it again, or take "
+            f"{GRAPH_HASH_KEY!r} out of its metadata if the change is yours"
+        )
+    return content
+
+
+def read_onnx_metadata(path: Path) -> dict[str, str]:
+    """Return the key-value pairs of an ``.onnx`` file, without a runtime or ONNX's own package.
+
+    Args:
+        path: The file.
+
+    Raises:
+        WeightsError: If it is not there, damaged, changed or foreign.
+    """
+    entries = {}
+    try:
+        for number, value in _fields(read_onnx(path)):
+            if number == _ONNX_METADATA:
+                entry = dict(_fields(value))
+                entries[entry[1].decode()] = entry[2].decode()
+    except (LookupError, ValueError) as error:
+        raise WeightsError(f"{path}: not a usable ONNX model (cut off or damaged; export it again)") from error
+    return entries
+
+
+def _fields(message: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield number and content of each field of a message of protobuf; of whole numbers nothing.
+
+    Raises:
+        IndexError: If it is cut off.
+        ValueError: If it holds what ONNX's outermost message does not.
+    """
+    at = 0
+
+    def whole_number() -> int:
+        nonlocal at
+        value = shift = 0
+        while True:
+            byte = message[at]
+            at, value, shift = at + 1, value | (byte & 127) << shift, shift + 7
+            if byte < 128:
+                return value
+
+    while at < len(message):
+        number, kind = divmod(whole_number(), 8)
+        if kind not in (0, 2):
+            raise ValueError(f"field {number} is of kind {kind}")
+        length = whole_number()
+        if kind == 2:
+            if at + length > len(message):
+                raise IndexError(f"field {number} is cut off")
+            yield number, message[at : at + length]
+            at += length
 
 
 def prepare_input(image: NDArray[np.uint8], info: ArtefactInfo) -> NDArray[Any]:

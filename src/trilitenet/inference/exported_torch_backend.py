@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,10 @@ class ExportedTorchBackend(ArtefactBackend):
         level = talker.level
         talker.setLevel(logging.ERROR)  # of a broken archive it logs a traceback
         try:
+            with zipfile.ZipFile(path) as archive:  # PyTorch does not look at its check sums
+                wrong = archive.testzip()
+            if wrong is not None:
+                raise zipfile.BadZipFile(f"{wrong} is damaged")
             program = torch.export.load(path, extra_files=metadata)
         except Exception as error:  # a broken archive fails in many ways
             raise WeightsError(

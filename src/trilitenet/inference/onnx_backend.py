@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from trilitenet.errors import BackendError, WeightsError, gist, import_extra
 from trilitenet.inference.backend import ParallelSessions, held
-from trilitenet.inference.exported import ArtefactBackend, check_graph, prepare_input, read_metadata
+from trilitenet.inference.exported import ArtefactBackend, check_graph, prepare_input, read_metadata, read_onnx
 
 __all__ = ["OnnxBackend"]
 
@@ -28,15 +28,14 @@ class OnnxBackend(ParallelSessions, ArtefactBackend):
 
     Raises:
         MissingExtraError: If ONNX Runtime is not installed.
-        WeightsError: If the file is missing, broken or foreign, or of a newer layout.
+        WeightsError: If the file is missing, broken, changed or foreign, or of a newer layout.
         BackendError: If the device is not there.
     """
 
     def __init__(self, path: str | os.PathLike[str], device: str = "auto", *, threads: int | None = None) -> None:
         runtime = import_extra("onnxruntime", "onnx")
         path = Path(path)
-        if not path.is_file():
-            raise WeightsError(f"{path}: no such file")
+        read_onnx(path)
         available = runtime.get_available_providers()
         if device not in ("auto", "cpu", "cuda"):
             raise BackendError(f"device {device!r} is not one of ONNX Runtime's here; use auto, cpu or cuda")

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from trilitenet.config import ARTEFACT_KEY, CARD_KEY, WEIGHTS_HASH_KEY
 from trilitenet.errors import BackendError, ConfigError, WeightsError, gist, import_extra
 from trilitenet.inference.backend import MOST_PARALLEL, check_process, held, replaced
-from trilitenet.inference.exported import ArtefactBackend, check_graph, prepare_input, read_metadata
+from trilitenet.inference.exported import ArtefactBackend, check_graph, prepare_input, read_metadata, read_onnx
 from trilitenet.processing.cores import usable_cores
 
 __all__ = ["OpenVINOBackend", "openvino_core"]
@@ -53,7 +53,7 @@ class OpenVINOBackend(ArtefactBackend):
 
     Raises:
         MissingExtraError: If OpenVINO is not installed.
-        WeightsError: If the file is missing, broken or foreign, or of a newer layout.
+        WeightsError: If the file is missing, broken, changed or foreign, or of a newer layout.
         BackendError: If the device is not there, or the artefact is an INT8 ``.onnx``.
     """
 
@@ -78,6 +78,8 @@ class OpenVINOBackend(ArtefactBackend):
         begins = (b"\x08",) if path.suffix.lower() == ".onnx" else (b"<?xml", b"<net")
         if len(start) < 64 or not start.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(begins):
             raise WeightsError(f"{path}: not a usable OpenVINO or ONNX model (it does not begin as one)")
+        if path.suffix.lower() == ".onnx":
+            read_onnx(path)
         weights = path.with_suffix(".bin")
         if path.suffix.lower() == ".xml" and not weights.is_file():
             raise WeightsError(f"{path}: its weights are missing; keep {weights.name} beside it")

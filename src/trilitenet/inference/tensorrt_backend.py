@@ -1,10 +1,12 @@
-"""Exported ``.engine`` artefacts on TensorRT. PyTorch is not needed; TensorRT and cuda-python are.
+"""Engines on TensorRT: ``.engine`` artefacts and ``.plan`` files. PyTorch is not needed; TensorRT and cuda-python are.
 
-No GPU was at hand when this was written: the reading of files is tested, the run on a GPU is not.
+No GPU was at hand when this was written: the reading of files is tested, the run on a GPU with a stand-in alone.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import json
 import os
 import struct
@@ -15,27 +17,28 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.config import ARTEFACT_KEY, CARD_KEY, ArtefactInfo, ModelCard, parse_json
+from trilitenet.config import ARTEFACT_KEY, CARD_KEY, GRAPH_HASH_KEY, ArtefactInfo, ModelCard, parse_json
 from trilitenet.errors import BackendError, WeightsError, import_extra
 from trilitenet.inference.backend import held
-from trilitenet.inference.exported import ArtefactBackend, prepare_input, read_metadata
+from trilitenet.inference.exported import ArtefactBackend, check_graph, prepare_input, read_metadata, read_onnx_metadata
 
-__all__ = ["MAGIC", "TensorRTBackend", "pack_engine", "unpack_engine"]
+__all__ = ["MAGIC", "TensorRTBackend", "pack_engine", "read_plan", "unpack_engine"]
 
 MAGIC: Final = b"TRILITENET-ENGINE\n"
 
 
 def pack_engine(engine: bytes, card: ModelCard, info: ArtefactInfo) -> bytes:
     """Return the file of an engine: magic, length of the header (4 bytes, little endian), JSON header, engine."""
-    header = json.dumps({CARD_KEY: card.to_json(), ARTEFACT_KEY: info.to_json()}).encode()
+    digest = hashlib.sha256(engine).hexdigest()
+    header = json.dumps({CARD_KEY: card.to_json(), ARTEFACT_KEY: info.to_json(), GRAPH_HASH_KEY: digest}).encode()
     return MAGIC + struct.pack("<I", len(header)) + header + engine
 
 
 def unpack_engine(path: Path) -> tuple[ModelCard, ArtefactInfo, bytes]:
-    """Read what `pack_engine` made.
+    """Read what `pack_engine` made; older files hold no hash of the engine.
 
     Raises:
-        WeightsError: If it is not such a file, or of a newer layout.
+        WeightsError: If it is not such a file, damaged, or of a newer layout.
     """
     if not path.is_file():
         raise WeightsError(f"{path}: no such file")
@@ -50,14 +53,37 @@ def unpack_engine(path: Path) -> tuple[ModelCard, ArtefactInfo, bytes]:
         raise WeightsError(f"{path}: its header is broken ({error})") from error
     if not isinstance(header, dict):
         raise WeightsError(f"{path}: its header is not a JSON object")
-    return *read_metadata(header, str(path)), data[start + length :]
+    card, info = read_metadata(header, str(path))
+    engine = data[start + length :]
+    if header.get(GRAPH_HASH_KEY) not in (None, hashlib.sha256(engine).hexdigest()):
+        raise WeightsError(f"{path}: its engine is damaged; build it again with: trilitenet export --format tensorrt")
+    return card, info, engine
 
 
-class TensorRTBackend(ArtefactBackend):  # pragma: no cover - needs a GPU and TensorRT
+def read_plan(path: Path) -> tuple[ModelCard, ArtefactInfo, bytes]:
+    """Read what ``trtexec --saveEngine`` wrote; what it is stands in the ``.onnx`` file of the same name beside it.
+
+    Returns:
+        The card, the description, whose precision is that of the graph, and the engine.
+
+    Raises:
+        WeightsError: If one of the two is missing, or the ``.onnx`` is damaged, foreign or of a newer layout.
+    """
+    if not path.is_file():
+        raise WeightsError(f"{path}: no such file")
+    graph = path.with_suffix(".onnx")
+    if not graph.is_file():
+        raise WeightsError(f"{path}: its card is missing; keep {graph.name}, which it was built from, beside it")
+    card, info = read_metadata(read_onnx_metadata(graph), str(graph))
+    return card, dataclasses.replace(info, format="tensorrt"), path.read_bytes()
+
+
+class TensorRTBackend(ArtefactBackend):
     """An artefact of ``trilitenet export --format tensorrt``.
 
     Args:
-        path: The ``.engine`` file.
+        path: The ``.engine`` file, or the ``.plan`` file that ``trtexec`` built, with the ``.onnx`` of the same name
+            beside it.
 
     Raises:
         MissingExtraError: If TensorRT or cuda-python is not installed.
@@ -67,28 +93,34 @@ class TensorRTBackend(ArtefactBackend):  # pragma: no cover - needs a GPU and Te
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._path = Path(path)
-        self._card, self.info, engine = unpack_engine(self._path)
+        plan = self._path.suffix.lower() == ".plan"
+        self._card, self.info, engine = read_plan(self._path) if plan else unpack_engine(self._path)
+        self._built = "plan" if plan else self.info.precision  # which a plan does not tell
         tensorrt = import_extra("tensorrt", "tensorrt")
         self._cuda = import_extra("cuda.bindings.runtime", "tensorrt")
         runtime = tensorrt.Runtime(tensorrt.Logger(tensorrt.Logger.ERROR))
         self._engine = runtime.deserialize_cuda_engine(engine)
         if self._engine is None:
             raise BackendError(f"{path}: TensorRT refuses this engine; build it on the GPU that runs it")
+        self._names = [self._engine.get_tensor_name(i) for i in range(self._engine.num_io_tensors)]
+        shapes = {name: tuple(self._engine.get_tensor_shape(name)) for name in self._names}
+        takes = [shape for name, shape in shapes.items() if name == "image"]
+        check_graph(takes, self._names, self._card, self.info, str(path))
+        if any(side < 0 for shape in shapes.values() for side in shape):
+            raise BackendError(f"{path}: has no fixed sizes; build it from the graph of: export --format tensorrt")
         self._context: Any = self._engine.create_execution_context()
         self._stream = self._call(self._cuda.cudaStreamCreate())
-        self._names = [self._engine.get_tensor_name(i) for i in range(self._engine.num_io_tensors)]
         self._memory: dict[str, int] = {}
         self._host: dict[str, NDArray[Any]] = {}
         for name in self._names:
-            shape = tuple(self._engine.get_tensor_shape(name))
-            self._host[name] = np.empty(shape, tensorrt.nptype(self._engine.get_tensor_dtype(name)))
+            self._host[name] = np.empty(shapes[name], tensorrt.nptype(self._engine.get_tensor_dtype(name)))
             self._memory[name] = self._call(self._cuda.cudaMalloc(self._host[name].nbytes))
             self._context.set_tensor_address(name, self._memory[name])
 
     @property
     def name(self) -> str:
-        """The runtime and the precision."""
-        return f"tensorrt cuda {self.info.precision}"
+        """The runtime and the precision; of a plan, which does not tell it, that it is one."""
+        return f"tensorrt cuda {self._built}"
 
     def _compute(self, batch: NDArray[np.uint8]) -> list[Mapping[str, NDArray[Any]]]:
         context, kinds = held(self._context, self._path), self._cuda.cudaMemcpyKind
