@@ -136,7 +136,8 @@ def measure(weights: str, arguments: argparse.Namespace, folder: Path) -> dict[s
         for name, ending in endings.items():
             calls[f"deploy openvino {precision}{ending}"] = openvino_call(deploy[name], precision, threads)
     if arguments.int8:
-        frames = list(np.random.default_rng(0).integers(0, 256, (8, 1, *SIZE, 3), np.uint8))
+        scenes = SyntheticScenes(1, SIZE)
+        frames = [scenes[index].image[None] for index in range(8)]
         for name, ending in endings.items():
             quantised = quantize_openvino(deploy[name], frames, KEEP_STEPS[1])
             calls[f"deploy openvino int8 + {OWN}{ending}"] = openvino_call(quantised, OWN, threads)

@@ -414,7 +414,9 @@ def test_what_is_asked_of_a_model_reaches_it(monkeypatch: pytest.MonkeyPatch) ->
 
     def load(model: str, **options: object) -> Predictor:
         asked.append((model, options))
-        return Predictor(ColourBackend())
+        backend = ColourBackend()
+        backend.name = str(options["backend"])
+        return Predictor(backend)
 
     monkeypatch.setattr("trilitenet.commands.benchmark.load", load)
     backends = ("onnxruntime", "openvino")
@@ -570,3 +572,11 @@ def test_memory_is_left_out_where_the_system_does_not_tell(monkeypatch: pytest.M
     result = benchmark("a", rounds=1, warmup=0, size=(32, 64))
     assert result.peak_memory is None
     assert "memory" not in result.summary()
+
+
+def test_options_that_change_no_entry_are_refused(artefacts: Artefacts) -> None:
+    file = str(artefacts.folder / "model.onnx")
+    with pytest.raises(ConfigError, match=r"--size would change nothing: inputs are fixed to \d+x\d+; leave it out"):
+        benchmark(file, backend="onnxruntime", rounds=1, warmup=0, size=(32, 64))
+    with pytest.raises(ConfigError, match="--streams would change nothing: OpenVINO alone"):
+        benchmark(file, backend="onnxruntime", rounds=1, warmup=0, streams=2)

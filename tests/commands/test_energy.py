@@ -61,6 +61,22 @@ def test_energy_is_that_of_what_the_model_runs_on(machine: Path, monkeypatch: py
     assert readings("torch cpu") == [None]
 
 
+def test_all_packages_count_and_go_on_where_their_counters_begin_anew(machine: Path) -> None:
+    def write(folder: str, **values: object) -> None:
+        (machine / folder).mkdir(exist_ok=True)
+        for file, value in values.items():
+            (machine / folder / file).write_text(f"{value}\n")
+
+    for number, microjoules in enumerate((1_000_000, 5_000_000)):
+        write(f"intel-rapl:{number}", name=f"package-{number}", energy_uj=microjoules, max_energy_range_uj=9_000_000)
+    write("intel-rapl:0:0", name="core", energy_uj=400_000, max_energy_range_uj=9_000_000)
+    write("intel-rapl:2", name="psys", energy_uj=70_000_000, max_energy_range_uj=90_000_000)
+    with energy_meters(["openvino cpu fp32"]) as (meter,):
+        assert meter() == 6.0
+        write("intel-rapl:1", energy_uj=500_000)
+        assert meter() == 10.5
+
+
 @pytest.mark.parametrize(
     ("shown", "joules"),
     [("1,0", [5.001, 5.0]), ("GPU-b, GPU-a", [5.001, 5.0]), ("1", [5.001, None]), ("", [None, None])],

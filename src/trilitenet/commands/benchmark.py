@@ -39,6 +39,8 @@ __all__ = ["Benchmark", "Cost", "Timing", "benchmark"]
 
 _LOGGER: Final = logging.getLogger(__name__)
 _PLOTS: Final = (".png", ".svg", ".pdf")
+_APART: Final = 10.0
+"""Where one median is more times another than this, the axis of a plot is logarithmic."""
 _RUNTIMES: Final = frozenset(BACKENDS) - {"auto"}
 _ENERGY_WINDOW: Final = 1.0
 """Seconds that each call is repeated for to measure its energy."""
@@ -299,6 +301,7 @@ def benchmark(
     result = Benchmark((), costs, _machine(threads, streams, ()), 0, None)
     with ExitStack() as stack:
         calls: list[_Call] = []
+        entries: list[_Entry] = []
         if timed:
             pairs = _fitting(names or ["tiny"], backend)
             film = None
@@ -307,7 +310,9 @@ def benchmark(
             for name, one in pairs:
                 entry = _Entry(name, one, device, streams, threads, own_builder(name, network))
                 stack.enter_context(entry.predictor)
-                calls += [_Call(entry, count, stage, size, source, film) for count in batch]
+                entries.append(entry)
+            _refuse_without_effect(entries, size, streams)
+            calls = [_Call(entry, count, stage, size, source, film) for entry in entries for count in batch]
             timings, memory = _measure(calls, rounds, warmup), peak_memory()
             machine = _machine(threads, streams, [call.entry.runtime for call in calls])
             bytes_held = None if math.isnan(memory) else round(memory * 2**20)
@@ -330,6 +335,22 @@ def _refuse_idle(**options: bool) -> None:
         raise ConfigError(
             f"{' and '.join(idle)} would change nothing: --table cost times nothing by itself; add --batch 1 8 32 for "
             "frames a second"
+        )
+
+
+def _refuse_without_effect(entries: Sequence[_Entry], size: tuple[int, int] | None, streams: int) -> None:
+    """Refuse options that change none of the entries.
+
+    Raises:
+        ConfigError: If there are any.
+    """
+    canvases = {entry.predictor.backend.canvas for entry in entries}
+    if size is not None and None not in canvases and canvases != {size}:
+        inputs = " and ".join(f"{width}x{height}" for height, width in sorted(filter(None, canvases)))
+        raise ConfigError(f"--size would change nothing: inputs are fixed to {inputs}; leave it out, or export anew")
+    if streams > 1 and not any(entry.runtime.startswith("openvino") for entry in entries):
+        raise ConfigError(
+            "--streams would change nothing: OpenVINO alone computes several images at once; leave it out"
         )
 
 
@@ -606,7 +627,18 @@ def _plot(calls: Sequence[_Call], path: Path) -> None:
     axes.invert_yaxis()
     what = "frame of the video" if calls[0].stage == "video" else "call"
     axes.set_xlabel(f"milliseconds a {what} (box: quartiles, whiskers: 1st and 99th percentile)")
-    axes.set_xlim(left=0)
+    medians = [float(np.median(call.milliseconds)) for call in calls]
+    if max(medians) > _APART * min(medians):
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")
+    else:
+        axes.set_xlim(left=0)
+    rows = axes.secondary_yaxis("right")
+    tails = (np.percentile(call.milliseconds, 99) for call in calls)
+    rows.set_yticks(
+        range(1, len(calls) + 1),
+        [f"median {middle:.1f}, p99 {tail:.1f}" for middle, tail in zip(medians, tails, strict=True)],
+    )
     picture = io.BytesIO()
     figure.savefig(picture, format=path.suffix[1:].lower())
     write_file(path, picture.getvalue())

@@ -23,6 +23,8 @@ Meter: TypeAlias = Callable[[], float | None]
 
 _RAIL: Final = re.compile(r"\b([A-Z]\w*) (\d+)(?:mW)?/\d+(?:mW)?(?!\S)")
 """A rail of `tegrastats`: its name, its milliwatts and their mean, with units or without."""
+_PACKAGE: Final = re.compile(r".*-rapl:\d+")
+"""What Linux calls the counter of a processor package; parts of it have another number."""
 _INTERVAL: Final = 100
 """Milliseconds between two of its lines."""
 _PATIENCE: Final = 3.0
@@ -33,7 +35,7 @@ _PATIENCE: Final = 3.0
 def energy_meters(backends: Sequence[str]) -> Iterator[list[Meter]]:
     """Read, while inside, the energy of what each backend runs on.
 
-    That is the GPU (by NVML) where the backend's name has it, else the processor package (by RAPL); where these tell
+    That is the GPU (by NVML) where the backend's name has it, else all processor packages (by RAPL); where these tell
     nothing, the board of a Jetson (by `tegrastats`).
 
     Args:
@@ -49,14 +51,36 @@ def energy_meters(backends: Sequence[str]) -> Iterator[list[Meter]]:
 
 def _own_meter(backend: str) -> Meter | None:
     index = gpu_index(backend)
-    return _package() if index is None else gpu_meter(index)
+    return _packages() if index is None else gpu_meter(index)
 
 
-def _package() -> Meter | None:
-    for rapl in sorted(Path("/sys/class/powercap").glob("*-rapl:0/energy_uj")):
-        if os.access(rapl, os.R_OK):
-            return lambda: int(rapl.read_text(encoding="ascii")) / 1e6
-    return None
+def _packages() -> Meter | None:
+    """Return what reads the joules of all processor packages together; None where one cannot be read."""
+    folders = [each for each in Path("/sys/class/powercap").glob("*-rapl:*") if _PACKAGE.fullmatch(each.name)]
+    folders = [each for each in folders if _word(each / "name", "package").startswith("package")]  # not the platform
+    if not folders or not all(os.access(each / "energy_uj", os.R_OK) for each in folders):
+        return None
+    counters = [_counter(each) for each in folders]
+    return lambda: sum(counter() for counter in counters) / 1e6
+
+
+def _counter(folder: Path) -> Callable[[], int]:
+    """Return what reads a counter of microjoules that goes on where the machine's begins anew."""
+    span = int(_word(folder / "max_energy_range_uj", "0"))
+    last = before = 0
+
+    def read() -> int:
+        nonlocal last, before
+        now = int(_word(folder / "energy_uj", "0"))
+        before += span if now < last else 0
+        last = now
+        return before + now
+
+    return read
+
+
+def _word(file: Path, otherwise: str) -> str:
+    return file.read_text(encoding="ascii").strip() if file.is_file() else otherwise
 
 
 def gpu_meter(index: int) -> Callable[[], float] | None:

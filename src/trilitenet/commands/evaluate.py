@@ -247,8 +247,8 @@ def hash_model(model: str) -> str | None:
     path = shipped_weights().get(model) or Path(model)
     if path.is_dir():
         return hash_files(file for file in path.rglob("*") if file.is_file())
-    # OpenVINO and NCNN keep weights beside the graph, NCNN the card as well.
-    beside = {".xml": (".bin",), ".param": (".bin", ".json")}.get(path.suffix, ())
+    # OpenVINO and NCNN keep weights beside the graph, NCNN the card as well; that of a plan is in the graph beside it.
+    beside = {".xml": (".bin",), ".param": (".bin", ".json"), ".plan": (".onnx",)}.get(path.suffix, ())
     files = [file for file in map(path.with_suffix, beside) if file.is_file()]
     if files and path.is_file():
         return hash_files([path, *files])
