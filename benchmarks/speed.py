@@ -6,7 +6,8 @@
 
 'Plain' is the network as it is, traced to ONNX with float input and logits out: no decoding, no thresholds. 'Deploy'
 takes pixels and gives decoded boxes and decided masks. OpenVINO computes in bf16 where the processor has it, else in
-fp32 (it would emulate bf16 on AVX-512 without it). Weights are the shipped ones, or those that --weights names.
+fp32 (it would emulate bf16 on AVX-512 without it). INT8 is calibrated on pictures of --calibration, else on eight
+synthetic scenes. Weights are the shipped ones, or those that --weights names.
 Random ones would slow both down: their PReLU slopes are all alike, which OpenVINO then does not fuse into convolutions.
 Ratios are medians over the rounds of plain time / own time, and in calm of the times' 10th percentiles.
 """
@@ -27,6 +28,7 @@ import numpy as np
 import openvino as ov
 import torch
 
+from trilitenet.commands.export import find_pictures
 from trilitenet.config import ArtefactInfo, Thresholds
 from trilitenet.data.synthetic import SyntheticScenes
 from trilitenet.deploy.graph import DeployGraph
@@ -111,6 +113,15 @@ def plain_frame(network: TriLiteNet, image: np.ndarray, argmax: bool) -> None:
     nms(xyxy, kept[:, 4] * kept[:, 5], np.zeros(len(rows), np.int64), 0.6, 300)
 
 
+def calibration_frames(folder: Path | None) -> list[np.ndarray]:
+    """Return what INT8 is calibrated on: at most 100 pictures of a folder or train split, or synthetic scenes."""
+    if folder is None:
+        scenes = SyntheticScenes(1, SIZE)
+        return [scenes[index].image[None] for index in range(8)]
+    images = (read_image(path) for path in find_pictures(folder, 100, "train"))
+    return [Letterbox.fit(image.shape[:2], canvas=SIZE).image(image)[None] for image in images]
+
+
 def measure(weights: str, arguments: argparse.Namespace, folder: Path) -> dict[str, dict[str, float]]:
     network = load_network(weights).eval()
     variant = network.card.variant
@@ -136,8 +147,7 @@ def measure(weights: str, arguments: argparse.Namespace, folder: Path) -> dict[s
         for name, ending in endings.items():
             calls[f"deploy openvino {precision}{ending}"] = openvino_call(deploy[name], precision, threads)
     if arguments.int8:
-        scenes = SyntheticScenes(1, SIZE)
-        frames = [scenes[index].image[None] for index in range(8)]
+        frames = calibration_frames(arguments.calibration)
         for name, ending in endings.items():
             quantised = quantize_openvino(deploy[name], frames, KEEP_STEPS[1])
             calls[f"deploy openvino int8 + {OWN}{ending}"] = openvino_call(quantised, OWN, threads)
@@ -205,6 +215,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--weights", nargs="+", default=["tiny", "small", "base"], help="names or files")
     parser.add_argument("--image", type=Path, help="of the whole frames; a synthetic 1280x720 one by default")
+    parser.add_argument("--calibration", type=Path, help="pictures for INT8; synthetic scenes by default")
     parser.add_argument("--rounds", type=int, default=30)
     parser.add_argument("--threads", type=int)
     parser.add_argument(

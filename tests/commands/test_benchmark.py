@@ -409,14 +409,20 @@ def test_the_first_result_is_that_of_the_first_call(watch: Watch, monkeypatch: p
     assert backend.batches == [(2, 32, 64, 3), (1, 32, 64, 3)] * 2
 
 
+class Streaming(ColourBackend):
+    """A backend that computes several images at once."""
+
+    def __init__(self, streams: int) -> None:
+        super().__init__()
+        self.streams = streams
+
+
 def test_what_is_asked_of_a_model_reaches_it(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
     def load(model: str, **options: object) -> Predictor:
         asked.append((model, options))
-        backend = ColourBackend()
-        backend.name = str(options["backend"])
-        return Predictor(backend)
+        return Predictor(Streaming(2 if options["backend"] == "openvino" else 1))
 
     monkeypatch.setattr("trilitenet.commands.benchmark.load", load)
     backends = ("onnxruntime", "openvino")
@@ -427,6 +433,7 @@ def test_what_is_asked_of_a_model_reaches_it(monkeypatch: pytest.MonkeyPatch) ->
     assert asked == [("a.onnx", {"backend": backend, **both}) for backend in backends]
     assert (result.machine["threads"], result.machine["streams"]) == ("3", "2")
     assert [row.threads for row in result.timings] == [3, 3]
+    assert [row.streams for row in result.timings] == [1, 2]
 
 
 def test_of_several_runtimes_each_file_runs_on_its_own(
@@ -580,3 +587,36 @@ def test_options_that_change_no_entry_are_refused(artefacts: Artefacts) -> None:
         benchmark(file, backend="onnxruntime", rounds=1, warmup=0, size=(32, 64))
     with pytest.raises(ConfigError, match="--streams would change nothing: OpenVINO alone"):
         benchmark(file, backend="onnxruntime", rounds=1, warmup=0, streams=2)
+
+
+@pytest.mark.parametrize(
+    ("times", "scale", "rows"),
+    [
+        ([2.0, 14.0, 283.0], "log", ["median 2.00, p99 2.00", "median 14.00, p99 14.00", "median 283.00, p99 283.00"]),
+        ([0.42, 4.83], "log", ["median 0.42, p99 0.42", "median 4.83, p99 4.83"]),
+        ([9.0, 22.25], "linear", ["median 9.00, p99 9.00", "median 22.25, p99 22.25"]),
+    ],
+)
+def test_a_plot_tells_its_numbers_and_is_logarithmic_over_decades(
+    times: list[float], scale: str, rows: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib")
+    from matplotlib.figure import Figure
+
+    drawn: list[Figure] = []
+    plain = Figure.savefig
+
+    def savefig(figure: Figure, *args: Any, **options: Any) -> None:
+        plain(figure, *args, **options)
+        drawn.append(figure)
+
+    monkeypatch.setattr(Figure, "savefig", savefig)
+    entry = SimpleNamespace(model="tiny", runtime="a runtime")
+    calls: Any = [SimpleNamespace(milliseconds=[one] * 3, batch=1, stage="network", entry=entry) for one in times]
+    command._plot(calls, tmp_path / "a.png")
+    (axes,) = drawn[0].axes
+    (right,) = axes.child_axes
+    assert axes.get_xscale() == scale
+    assert [label.get_text() for label in right.get_yticklabels()] == rows
+    numbers = [label.get_text() for label in axes.get_xticklabels(which="both")]
+    assert not any("times" in number for number in numbers)  # as it is, not as a power of ten

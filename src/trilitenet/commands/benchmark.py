@@ -75,7 +75,8 @@ class Timing:
         first_result: Seconds from loading the model to its first result, of a video to its end; its runtime had been
             imported before.
         threads: Of a runtime on the CPU, as asked for, or as PyTorch tells; None where that is not known.
-        joules: A frame, of the GPU where the runtime is on one, else of the processor package; of a Jetson, the whole
+        streams: Images it computes at once, which ``backend`` tells as well; 1 where a runtime has none.
+        joules: A frame, of the GPU where the runtime is on one, else of all processor packages; of a Jetson, the whole
             module's. From five seconds in which nothing else was measured, of a video from the rounds; None where it
             cannot be read.
         watts: Mean over these seconds or rounds; None likewise.
@@ -96,6 +97,7 @@ class Timing:
     ratio: float
     first_result: float
     threads: int | None = None
+    streams: int = 1
     joules: float | None = None
     watts: float | None = None
     watts_std: float | None = None
@@ -223,8 +225,8 @@ def benchmark(
             of one's own beside them); and frames a second with --batch (such as 1 8 32), --backend or --rounds.
         rounds: Timed calls an entry, 50 if left out and 5 of a video; every round calls each entry once.
         warmup: Calls before, 5 if left out and none of a video, whose first run is not timed anyway.
-        size: Height and width of the network's input, where a model takes any; by default what each was trained at.
-            --stage frame and video take the longer side.
+        size: Height and width of the network's input (384 640), where a model takes any; by default what each was
+            trained at. --stage frame and video take the longer side.
         source: Height and width of the image for --stage frame, and of the synthetic clip for --stage video; 720 1280
             if left out.
         video: Clip for --stage video, all of which is done in each call; two synthetic seconds if left out.
@@ -348,7 +350,7 @@ def _refuse_without_effect(entries: Sequence[_Entry], size: tuple[int, int] | No
     if size is not None and None not in canvases and canvases != {size}:
         inputs = " and ".join(f"{width}x{height}" for height, width in sorted(filter(None, canvases)))
         raise ConfigError(f"--size would change nothing: inputs are fixed to {inputs}; leave it out, or export anew")
-    if streams > 1 and not any(entry.runtime.startswith("openvino") for entry in entries):
+    if streams > 1 and all(entry.streams == 1 for entry in entries):
         raise ConfigError(
             "--streams would change nothing: OpenVINO alone computes several images at once; leave it out"
         )
@@ -401,6 +403,7 @@ class _Entry:
         self.threads = None if any(word.startswith(("cuda", "gpu", "npu")) for word in words) else threads
         if self.threads is None and words[0] == "torch" and "cpu" in words:
             self.threads = sys.modules["torch"].get_num_threads()
+        self.streams: int = getattr(self.predictor.backend, "streams", 1)
 
     @property
     def runtime(self) -> str:
@@ -563,6 +566,7 @@ def _measure(calls: Sequence[_Call], rounds: int, warmup: int) -> tuple[Timing, 
                 ratio=float(np.median(first / (times / call.unit))),
                 first_result=call.entry.first or 0.0,
                 threads=call.entry.threads,
+                streams=call.entry.streams,
                 joules=float(np.mean(call.joules)) if call.joules else None,
                 watts=float(np.mean(call.watts)) if call.watts else None,
                 watts_std=_std(call.watts),
@@ -615,6 +619,7 @@ def _costs(names: Sequence[str], size: tuple[int, int] | None, network: str | No
 
 def _plot(calls: Sequence[_Call], path: Path) -> None:
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     names = _short([call.entry.model for call in calls])
     figure = Figure(figsize=(8, 1 + 0.6 * len(calls)), layout="constrained")
@@ -630,14 +635,16 @@ def _plot(calls: Sequence[_Call], path: Path) -> None:
     medians = [float(np.median(call.milliseconds)) for call in calls]
     if max(medians) > _APART * min(medians):
         axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
     else:
         axes.set_xlim(left=0)
     rows = axes.secondary_yaxis("right")
     tails = (np.percentile(call.milliseconds, 99) for call in calls)
     rows.set_yticks(
         range(1, len(calls) + 1),
-        [f"median {middle:.1f}, p99 {tail:.1f}" for middle, tail in zip(medians, tails, strict=True)],
+        [f"median {middle:.2f}, p99 {tail:.2f}" for middle, tail in zip(medians, tails, strict=True)],
     )
     picture = io.BytesIO()
     figure.savefig(picture, format=path.suffix[1:].lower())
