@@ -114,6 +114,11 @@ def test_a_size_is_height_by_width_and_turned_round_told(tmp_path: Path, caplog:
     (told,) = caplog.messages
     assert "--size 96x64 is an upright input, 96 high and 64 wide" in told
     assert "as trained, 96 wide and 64 high, is --size 64x96" in told
+    caplog.clear()
+    save_network(network, tmp_path / "upright.safetensors", dataclasses.replace(network.card, input_size=(96, 64)))
+    export(tmp_path / "upright.safetensors", output=tmp_path / "upright.onnx", size="64x96")
+    (told,) = caplog.messages
+    assert told.startswith("--size 64x96 is a wide input, 64 high and 96 wide; as trained, 64 wide and 96 high, is")
 
 
 def test_an_engine_is_not_called_onnx(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,6 +30,7 @@ from trilitenet.config import TASKS, VARIANTS, check_size
 from trilitenet.data.synthetic_drive import SyntheticDrive
 from trilitenet.engine.provenance import describe_hardware, peak_memory
 from trilitenet.errors import ConfigError, InputError, import_extra, scratch_folder, write_file
+from trilitenet.inference.backend import streams_of
 from trilitenet.inference.predictor import Predictor
 from trilitenet.inference.sources import Clip, FrameReader, find_sources
 from trilitenet.inference.video import VideoWriter
@@ -403,7 +404,7 @@ class _Entry:
         self.threads = None if any(word.startswith(("cuda", "gpu", "npu")) for word in words) else threads
         if self.threads is None and words[0] == "torch" and "cpu" in words:
             self.threads = sys.modules["torch"].get_num_threads()
-        self.streams: int = getattr(self.predictor.backend, "streams", 1)
+        self.streams = streams_of(self.predictor.backend) or 1
 
     @property
     def runtime(self) -> str:

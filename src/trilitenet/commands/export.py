@@ -207,14 +207,6 @@ def export(
     path = _destination(model, format, output)
     _check_files(path, format, overwrite)
     trained = load_network(model, network)
-    if parsed == usual[::-1] != usual and format != "triton":  # the export inside it says so
-        _LOGGER.warning(
-            "--size %dx%d is an upright input, %d high and %d wide; as trained, %d wide and %d high, is --size %dx%d",
-            *parsed,
-            *parsed,
-            *parsed,
-            *usual,
-        )
     if nms and "detection" not in trained.tasks:
         raise ConfigError(f"{model} has no detection task, so there are no boxes to suppress; leave --nms out")
     if format == "triton":
@@ -246,6 +238,8 @@ def export(
         serve = f"Serve it with: tritonserver --model-repository {path.parent.resolve()}"
         return dataclasses.replace(exported, path=path, notes=(*exported.notes, serve))
 
+    if parsed == usual[::-1] != usual:
+        _tell_turned(parsed, usual)
     masks = masks or ("logit" if portable else "decision")
     info = ArtefactInfo(
         format=format,
@@ -399,6 +393,15 @@ def _parse_size(size: SizeText) -> tuple[int, int] | None:
     canvas = int(match[1]), int(match[2])
     check_size(canvas, "--size")
     return canvas
+
+
+def _tell_turned(size: tuple[int, int], usual: tuple[int, int]) -> None:
+    """Warn of a (height, width) that is the one of training turned round, as if it had been meant width first."""
+    (height, width), (usual_height, usual_width) = size, usual
+    kind = "an upright" if height > width else "a wide"
+    asked = f"--size {height}x{width} is {kind} input, {height} high and {width} wide"
+    trained = f"{usual_width} wide and {usual_height} high, is --size {usual_height}x{usual_width}"
+    _LOGGER.warning("%s; as trained, %s", asked, trained)
 
 
 def _canvases(source: Path | None, canvas: tuple[int, int], count: int) -> list[NDArray[np.uint8]]:

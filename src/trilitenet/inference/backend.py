@@ -26,6 +26,7 @@ __all__ = [
     "held",
     "out_of_memory",
     "replaced",
+    "streams_of",
 ]
 
 T = TypeVar("T")
@@ -150,8 +151,8 @@ class Backend(Protocol):
         name: The runtime and the device, for reports: ``"torch cpu"``.
         canvas: (height, width) in pixels if the input size is fixed; None if any multiples of 32 will do.
 
-    Some have more, which is looked for and may be lacking: ``info`` (see `artefact_info`), ``streams`` (so many images
-    are computed at once) and ``in_parallel`` (see `ParallelSessions`).
+    Some have more, which is looked for and may be lacking: ``info`` (see `artefact_info`), ``streams`` (see
+    `streams_of`) and ``in_parallel`` (see `ParallelSessions`).
     """
 
     @property
@@ -184,3 +185,9 @@ def artefact_info(backend: Backend) -> ArtefactInfo | None:
     """Return how an artefact takes pixels and returns results; None of a backend that runs none."""
     info: ArtefactInfo | None = getattr(backend, "info", None)
     return info
+
+
+def streams_of(backend: Backend) -> int | None:
+    """Return how many images a backend computes at once; None of one that has no streams."""
+    streams: int | None = getattr(backend, "streams", None)
+    return streams

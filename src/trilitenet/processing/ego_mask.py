@@ -102,12 +102,13 @@ class EgoMask:
             ShapeError: If it is of another shape than the mask.
         """
         own = self.of(perception.size)
+        rest = ~own
         boxes = perception.boxes
         return dataclasses.replace(
             perception,
             boxes=None if boxes is None else boxes.select(~lie_on_mask(boxes.xyxy, own)),
-            drivable=None if perception.drivable is None else perception.drivable & ~own,
-            lane=None if perception.lane is None else perception.lane & ~own,
+            drivable=None if perception.drivable is None else perception.drivable & rest,
+            lane=None if perception.lane is None else perception.lane & rest,
         )
 
     def _fit(self, size: tuple[int, int]) -> NDArray[np.bool_]:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from trilitenet.commands.paths import NameOrPath, StrPath
 from trilitenet.errors import ConfigError, InputError, import_extra
+from trilitenet.inference.backend import streams_of
 
 __all__ = ["serve"]
 
@@ -112,9 +113,7 @@ def serve(
         ) as predictor,
     ):
         if not max_batch:
-            settings = dataclasses.replace(
-                settings, max_batch=getattr(predictor.backend, "streams", settings.max_batch)
-            )
+            settings = dataclasses.replace(settings, max_batch=streams_of(predictor.backend) or settings.max_batch)
         gc.collect()
         gc.freeze()  # what is there now stays: collections while serving need not go through it again and again
         try:
