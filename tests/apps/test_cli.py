@@ -15,6 +15,7 @@ from typing import Any, get_args
 
 import cyclopts
 import pytest
+from PIL import Image
 
 from trilitenet.apps import cli
 from trilitenet.config import shipped_weights
@@ -296,8 +297,8 @@ def test_threads_wait_less_at_full_load_where_a_network_is_only_run(
     assert os.environ.get("GOMP_SPINCOUNT") == spins
 
 
-def test_a_size_in_one_word_is_told_to_have_two(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["benchmark", "--size", "384x640"]) == 2
+def test_half_a_size_is_told_to_have_two_values(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["benchmark", "--size", "384"]) == 2
     assert "--size requires 2 values, got 1 (see: trilitenet benchmark --help)" in capsys.readouterr().err.replace(
         '"', ""
     )
@@ -402,6 +403,31 @@ def test_no_second_value_is_taken_for_a_file(
     (tmp_path / "DIR").mkdir()
     monkeypatch.chdir(tmp_path)
     assert cli._repeated(words.split()) == spread.split()
+
+
+@pytest.mark.parametrize(
+    ("words", "taken"),
+    [
+        ("benchmark tiny --size 384x640 --rounds 2", "benchmark tiny --size 384 640 --rounds 2"),
+        ("benchmark tiny --size=384x640 --source 720X1280", "benchmark tiny --size 384 640 --source 720 1280"),
+        ("benchmark --size 384 640 tiny", "benchmark --size 384 640 tiny"),
+        ("train r.yaml --input-size 384x640", "train r.yaml --input-size 384 640"),
+        ("predict 384x640 --output 640x360", "predict 384x640 --output 640x360"),
+        ("export tiny --size 384 640 --format onnx", "export tiny --size 384x640 --format onnx"),
+        ("export tiny --size 384x640 640", "export tiny --size 384x640 640"),
+        ("export tiny --size=384x640", "export tiny --size=384x640"),
+        ("evaluate-table tiny --size 384 640", "evaluate-table tiny --size 384x640"),
+    ],
+)
+def test_a_size_is_one_word_or_two(words: str, taken: str) -> None:
+    assert cli._sized(words.split()) == taken.split()
+
+
+def test_a_size_of_one_word_reaches_a_command_that_takes_two(tmp_path: Path) -> None:
+    assert cli.main(["data", "synthesize", str(tmp_path / "s"), "--count", "1", "--size", "96x160"]) == 0
+    (picture,) = (tmp_path / "s" / "images" / "train").iterdir()
+    with Image.open(picture) as image:
+        assert image.size == (160, 96)
 
 
 def test_the_values_that_may_follow_are_those_that_there_are() -> None:

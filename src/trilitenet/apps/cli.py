@@ -212,6 +212,27 @@ def _repeated(words: Sequence[str]) -> list[str]:
     return spread
 
 
+_SIZES: Final = ("--input-size", "--size", "--source")
+"""Options that take a height and a width: as one word where a command knows other sizes too, else as two."""
+_SIZES_OF_ONE_WORD: Final = ("evaluate-table", "export")
+
+
+def _sized(words: Sequence[str]) -> list[str]:
+    """Return ``384x640`` and ``384 640`` behind an option of a size, which mean the same, in the form that it takes."""
+    joined = bool(words) and words[0] in _SIZES_OF_ONE_WORD
+    line: list[str] = []
+    for word in words:
+        option, equals, value = word.partition("=")
+        size = re.fullmatch(r"(\d+)[xX](\d+)", value if equals else word)
+        if size is not None and not joined and (option in _SIZES if equals else line[-1:] and line[-1] in _SIZES):
+            line += [option, *size.groups()] if equals else size.groups()
+        elif joined and word.isdecimal() and len(line) > 1 and line[-1].isdecimal() and line[-2] in _SIZES:
+            line[-1] += f"x{word}"
+        else:
+            line.append(word)
+    return line
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Run the command line.
 
@@ -236,7 +257,7 @@ def main(words: Sequence[str] | None = None) -> int:
         if not known:
             raise ConfigError(f"TRILITENET_LOG={level} is no level of a log; take DEBUG, INFO, WARNING or ERROR")
         _check_command(words)
-        words = [_HYPHEN if word == "-" else word for word in _repeated(words)]
+        words = [_HYPHEN if word == "-" else word for word in _repeated(_sized(words))]
         with needing_torch():
             app = build_app(words)
             with _interruptible(ends):
