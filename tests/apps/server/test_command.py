@@ -135,6 +135,12 @@ def test_batches_are_as_large_as_there_are_streams(started: list[Any], backend: 
     assert [_settings(server).max_batch for server in started] == [8, 3, 5]
 
 
+def test_streams_of_a_runtime_without_any_are_refused(started: list[Any]) -> None:
+    with pytest.raises(ConfigError, match=r"^tiny runs on .*, and --streams is for OpenVINO alone"):
+        command.serve(port=0, streams=2)
+    assert started == []
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere these options mean other things")
 def test_a_port_can_be_taken_again_at_once_and_v6_leaves_v4_alone() -> None:
     with command._listen("127.0.0.1", 0) as listener:

@@ -69,7 +69,8 @@ def serve(
         log_level: What is logged: debug, info, warning or error.
 
     Raises:
-        ConfigError: If a limit is out of range, the token too short, or the port taken.
+        ConfigError: If a limit is out of range, the token too short, the port taken, or several streams are asked of a
+            runtime that has none.
         MissingExtraError: If the extra "serve" is not installed.
     """
     for module in ("fastapi", "uvicorn", "httptools", "prometheus_client"):
@@ -112,6 +113,11 @@ def serve(
             model, network=network, device=device, backend=backend, confidence=confidence, streams=streams
         ) as predictor,
     ):
+        if streams > 1 and streams_of(predictor.backend) is None:
+            raise ConfigError(
+                f"{model} runs on {predictor.backend.name}, and --streams is for OpenVINO alone; leave it out, or "
+                "serve what trilitenet export --format openvino makes"
+            )
         if not max_batch:
             settings = dataclasses.replace(settings, max_batch=streams_of(predictor.backend) or settings.max_batch)
         gc.collect()
