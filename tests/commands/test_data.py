@@ -357,6 +357,11 @@ def test_show_sheets_and_pages(published: Path, tmp_path: Path) -> None:
         show(published, sheet, split="val", start=24)
     with pytest.raises(ConfigError, match="ATTRIBUTE=VALUE"):
         show(published, sheet, where=["night"])
+    assert show(published, tmp_path / "none.html", where=["timeofday=undefined"]).count == 1
+    with pytest.raises(DataError, match=r"none has the attribute 'timofday'; did you mean 'timeofday'\?$"):
+        show(published, sheet, where=["timofday=undefined"])
+    with pytest.raises(ConfigError, match="one value of an attribute, got timeofday=night and timeofday=day"):
+        show(published, sheet, where=["timeofday=night", "timeofday=day"])
     with pytest.raises(OutputError, match="must end in"):
         show(published, tmp_path / "x.pdf")
 

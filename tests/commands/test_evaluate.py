@@ -3,6 +3,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -210,6 +211,7 @@ def test_negative_counts_are_refused_before_the_work(
         ({"resolution": (99999,)}, "--resolution must be of 1 to 16384, got 99999"),
         ({"corruptions": True, "severities": (3, 6)}, "--severities must be of 1 to 5, got 3, 6"),
         ({"corruptions": True, "severities": ()}, "--severities must be of 1 to 5, got none"),
+        ({"severities": (1, 3)}, "--severities is for --corruptions; give both"),
         ({"batch_size": 0}, "--batch-size must be at least 1, got 0"),
         ({"paper_batch": 0}, "--paper-batch must be at least 1, got 0"),
     ],
@@ -385,6 +387,18 @@ def test_the_hash_of_files_does_not_hang_on_their_order(tmp_path: Path) -> None:
     assert hash_files(paths) == hash_files(paths[::-1])
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are text elsewhere")
+def test_images_of_names_that_are_no_text_are_evaluated(weights: Path, data: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(data, tmp_path / "copy")
+    images = sorted((copy / "images/val").iterdir())
+    for path in (images[0], *copy.glob(f"*/val/{images[0].stem}.*")):
+        if path.exists():
+            path.rename(path.with_name(os.fsdecode(b"na\xefve") + path.suffix))
+    report = evaluate(weights, data=copy, resamples=0, corruptions=True, severities=(1,), output=tmp_path / "report")
+    assert report.provenance.images == len(images)
+    assert (tmp_path / "report/report.json").is_file()
+
+
 def test_what_is_asked_of_the_model_reaches_it(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given: dict[str, object] = {}
 
@@ -421,11 +435,11 @@ def test_what_is_asked_of_a_measurement_reaches_every_pass(
         monkeypatch.setattr(f"trilitenet.commands.evaluate.{name}", note)
     each: dict[str, Any] = {"protocol": "both", "batch_size": 2, "limit": 3, "paper_batch": 5}
     once: dict[str, Any] = {"resamples": 7, "worst": 2, "by": ("scene",)}
-    evaluate(weights, data=data, corruptions=True, severities=(2,), resolution=(96,), **each, **once)
+    evaluate(weights, data=data, corruptions=True, severities=(2, 1, 2), resolution=(96,), **each, **once)
     assert len(given) == 3
     assert all(options.items() >= each.items() and options["progress"] is not None for options in given)
     assert given[0].items() >= once.items()
-    assert given[1]["severities"] == (2,)
+    assert given[1]["severities"] == (2, 1)  # each once, or a mean would take one twice
 
 
 def test_what_is_asked_of_a_score_reaches_it(

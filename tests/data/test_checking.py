@@ -185,6 +185,10 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object]]] = {
         lambda root: (root / "index.csv").write_bytes("name,split\nstraße,train\n".encode("latin-1")),
     ),
     "index names no image": ("index", lambda root: (root / "index.csv").open("a").write("nobody,train,x\n")),
+    "index lists an image twice": (
+        "index",
+        lambda root: (root / "index.csv").open("a").write("train_0007,train,strain1\n"),
+    ),
     "no such split": ("split-missing", lambda root: (root / "dataset.yaml").write_text("splits: [train, val, test]\n")),
     "a split without images": ("split-missing", lambda root: (root / "images" / "test").mkdir()),
     "no such ego mask": ("ego-mask", lambda root: (root / "dataset.yaml").open("a").write("ego_mask: nope.png\n")),
@@ -204,6 +208,26 @@ def test_every_planted_fault_is_found_and_nothing_else(root: Path, fault: str) -
     assert kinds(report) == {kind}
     assert report.findings[0].examples
     assert not report.ok
+
+
+def test_a_sequence_that_annotations_name_is_looked_at_too(root: Path) -> None:
+    (root / "index.csv").unlink()
+    for split, name in (("train", "train_0001"), ("val", "val_0001")):
+        write_annotation(root, split, name, [], source="city", sequence="7")
+    (finding,) = check_dataset(root).findings
+    assert (finding.kind, finding.split, finding.examples) == ("leak-sequence", "train, val", ("city/7",))
+    (root / "index.csv").write_text("name,split,sequence\nval_0001,val,8\n")  # which counts more
+    assert kinds(check_dataset(root)) == {"index"}
+
+
+def test_attributes_of_null_are_not_stated(root: Path) -> None:
+    (root / "index.csv").unlink()
+    for split, name in (("train", "train_0001"), ("val", "val_0001")):
+        content = {"frames": [], "attributes": {"weather": "rainy", "sequence": None, "scene": None}}
+        (root / f"det_annotations/{split}/{name}.json").write_text(json.dumps(content))
+    report = check_dataset(root)
+    assert report.ok
+    assert report.conditions.keys() == {"timeofday", "weather"}
 
 
 def test_a_file_that_is_not_read_is_named_with_the_cure(root: Path) -> None:

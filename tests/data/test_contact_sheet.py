@@ -34,6 +34,17 @@ def test_a_caption_names_the_image(monkeypatch: pytest.MonkeyPatch) -> None:
     assert written[1] == f"val/{sample.name[:30]}  night  no boxes, area"
 
 
+@pytest.mark.parametrize("name", ["na\udcefve", "\udcff"])
+def test_a_name_that_is_no_text_is_written_in_escapes(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    written: list[str] = []
+    monkeypatch.setattr(cv2, "putText", lambda _, text, *__: written.append(text))  # itself it would crash
+    mask = np.zeros((36, 64), np.uint8)
+    boxes, class_id = np.zeros((0, 4), np.float32), np.zeros(0, np.int64)
+    thumbnail(Sample(name, np.zeros((36, 64, 3), np.uint8), boxes, class_id, drivable=mask, lane=mask), ("vehicle",))
+    assert written == [name.encode("utf-8", "backslashreplace").decode()]
+    assert written[0].isascii()
+
+
 def test_alternative_areas_are_tinted_less_than_direct_ones(tmp_path: Path) -> None:
     write_published(tmp_path, "train", 2)
     mask = np.zeros((72, 128), np.uint8)

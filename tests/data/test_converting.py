@@ -150,6 +150,9 @@ def test_options_are_checked_and_kept(raw: Path, tmp_path: Path) -> None:
     for width in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(ConfigError, match="above 0 and finite"):
             ConversionOptions(lane_width={"*": width})
+    for gap in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(ConfigError, match="max_gap must be finite and not negative"):
+            ConversionOptions(max_gap=gap)
     with pytest.raises(DataError, match="both"):
         ConversionOptions(classes={"small": ("car",), "large": ("car",)})
     convert(read_bdd100k(raw), tmp_path / "out")

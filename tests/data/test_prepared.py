@@ -536,6 +536,20 @@ def test_an_own_car_mask_elsewhere(root: Path, tmp_path: Path) -> None:
     assert isinstance(open_dataset(root, "train", canvas=CANVAS), DrivingDataset)
 
 
+def test_a_split_of_any_name_is_copied_from_an_address(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trilitenet.data.prepared._PAUSES", ())
+    split = "jour d'été #1 50%"
+    for folder in root.glob("*/val"):
+        folder.rename(folder.with_name(split))
+    prepare(root, tmp_path / "out", canvas=CANVAS, splits=[split])
+    with serving(tmp_path / "out") as site:
+        there = open_dataset(site.address, split, cache=tmp_path / "cache")
+        assert len(there) == 3
+        np.testing.assert_array_equal(there[2].image, PreparedDataset(tmp_path / "out", split)[2].image)
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="names of files are text elsewhere")
 def test_names_that_are_no_text_are_prepared(root: Path, tmp_path: Path) -> None:
     name = os.fsdecode(b"\xff")
@@ -545,6 +559,7 @@ def test_names_that_are_no_text_are_prepared(root: Path, tmp_path: Path) -> None
     packed = open_dataset(root, "val", canvas=CANVAS)
     assert isinstance(packed, PreparedDataset)
     assert packed[-1].name == DrivingDataset(root, "val")[2].name == name
+    assert tell_apart(identify(packed), identify(DrivingDataset(root, "val"))) is None
 
 
 def test_a_full_disk_is_told(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -144,8 +144,11 @@ def test_index_gives_attributes(root: Path) -> None:
     (root / "index.csv").write_bytes("name,split\nstraße,train\n".encode("latin-1"))
     with pytest.raises(DataError, match=r"index\.csv: cannot be read as CSV in UTF-8"):
         DrivingDataset(root, "train")
-    (root / "index.csv").write_text("hello\n")
-    with pytest.raises(DataError, match="'name' and 'split'"):
+    (root / "index.csv").write_text("name;split\ntrain_0000;train\n")
+    with pytest.raises(DataError, match=r"'name' and 'split', separated by commas; its columns: name;split$"):
+        DrivingDataset(root, "train")
+    (root / "index.csv").write_text("")
+    with pytest.raises(DataError, match=r"its columns: none$"):
         DrivingDataset(root, "train")
 
 
@@ -245,10 +248,10 @@ def test_errors_name_the_file(root: Path) -> None:
     with pytest.raises(DataError, match=r"train_0003\.json: not JSON"):
         dataset[3]
     (root / "det_annotations/train/train_0004.json").write_text('{"frames": [{"objects": [{"box2d": {}}]}]}')
-    with pytest.raises(DataError, match="train_0004: not an annotation"):
+    with pytest.raises(DataError, match=r"train_0004\.json: not an annotation"):
         dataset[4]
     (root / "det_annotations/train/train_0005.json").write_text('{"frames": [], "attributes": ["night"]}')
-    with pytest.raises(DataError, match="train_0005: not an annotation"):
+    with pytest.raises(DataError, match=r"train_0005\.json: not an annotation"):
         dataset.attributes(5)
     with pytest.raises(DataError, match="not an image"):
         decode_image(b"", "nothing")
@@ -292,6 +295,18 @@ def test_what_no_image_has_to_sample_by_is_told(root: Path, caplog: pytest.LogCa
     ]
 
 
+def test_images_without_an_attribute_are_sampled_by_what_the_check_calls_them(
+    root: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    dataset = DrivingDataset(root, "train")
+    without = ["timeofday" not in dataset.attributes(index) for index in range(len(dataset))]
+    assert set(without) == {True, False}
+    for name in ("undefined", ""):
+        weights = sampling_weights(dataset, {"timeofday": {name: 3.0, "day": 1.0}})
+        assert weights.tolist() == [3.0 if one else 1.0 for one in without]
+    assert not caplog.messages
+
+
 def test_a_sample_is_checked() -> None:
     image = np.zeros((4, 6, 3), np.uint8)
     with pytest.raises(ShapeError, match="uint8"):
@@ -330,6 +345,14 @@ def test_a_number_that_no_float_is_makes_a_broken_annotation() -> None:
     box = {"category": "car", "box2d": {"x1": 0, "y1": 0, "x2": 10**400, "y2": 9}}
     with pytest.raises(DataError, match=r"^x\.json: not an annotation in the per-image form"):
         parse_annotation({"frames": [{"objects": [box]}]}, {"car": 0}, (), (9, 9), "x.json")
+
+
+def test_an_attribute_of_null_is_none(root: Path) -> None:
+    """As text it would be one value, and all images without a sequence one sequence."""
+    path = root / "det_annotations/train/train_0000.json"
+    path.write_text('{"frames": [], "attributes": {"weather": "rainy", "sequence": null, "lanes": 0}}')
+    dataset = DrivingDataset(root, "train")
+    assert dataset[0].attributes == dataset.attributes(0) == {"weather": "rainy", "lanes": "0"}
 
 
 def test_an_image_of_an_absurd_size_is_a_broken_one() -> None:

@@ -213,6 +213,15 @@ def test_writing_refuses_to_mix_with_what_is_there(tmp_path: Path) -> None:
         write_dataset(tmp_path, "more", count=0)
 
 
+def test_a_seed_that_another_split_has_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_dataset(tmp_path, "train", count=2, seed=1, size=SIZE)
+    write_dataset(tmp_path, "val", count=1, seed=2, size=SIZE)
+    assert not caplog.text
+    write_dataset(tmp_path, "test", count=1, seed=1, size=SIZE)
+    assert "images/train has the scenes of seed 1, too; another seed gives other scenes" in caplog.text
+    assert "images/val" not in caplog.text
+
+
 @pytest.mark.parametrize("workers", [1, 2])
 def test_the_same_call_goes_on_where_one_was_interrupted(tmp_path: Path, workers: int) -> None:
     def stop(done: int, count: int) -> None:

@@ -24,7 +24,7 @@ from trilitenet.data.converting import convert as run_conversion
 from trilitenet.data.description import DatasetDescription, folder_name
 from trilitenet.data.prepared import CACHE_FOLDER, is_prepared
 from trilitenet.data.prepared import prepare as run_preparation
-from trilitenet.data.reading import DrivingDataset, check_root, split_folders
+from trilitenet.data.reading import UNDEFINED, DrivingDataset, check_root, split_folders
 from trilitenet.data.records import RecordSource
 from trilitenet.engine.report import render
 from trilitenet.errors import ConfigError, DataError, OutputError, did_you_mean, few, write_file
@@ -298,7 +298,8 @@ def show(
         root: A data set in the published layout.
         output: The picture or page to write.
         split: Show this split; all if left out.
-        where: Only images with an attribute, for example ``timeofday=night`` or ``source=city``; all must hold.
+        where: Only images with an attribute, for example ``timeofday=night`` or ``source=city``, or without it
+            (``timeofday=undefined``); all must hold.
         count: How many images a split.
         start: Leave out the first so many: the next sheet of the same seed.
         seed: Of the random order.
@@ -322,11 +323,13 @@ def show(
     for option, value, least in numbers:
         if value < least:
             raise ConfigError(f"{option} must be at least {least}, got {value}")
-    wanted = dict(_pair(item) for item in where)
+    wanted = _conditions(where)
     datasets = {name: DrivingDataset(root, name) for name in ([split] if split else _splits(root))}
+    # Of an attribute that no image has, a slip as a rule, none is without it.
+    slips = [key for key, value in wanted.items() if value == UNDEFINED and not _is_known(key, datasets.values())]
     groups = {}
     for name, dataset in datasets.items():
-        indices = pick(dataset, wanted, count, seed=seed, start=start)
+        indices = [] if slips else pick(dataset, wanted, count, seed=seed, start=start)
         if indices:
             groups[name] = (dataset, indices)
     if not groups:
@@ -480,11 +483,21 @@ def _widths(items: Sequence[str]) -> dict[str, float]:
     return widths if "*" in widths else {"train": 8.0, "*": 2.0, **widths}
 
 
-def _pair(item: str) -> tuple[str, str]:
-    key, equals, value = item.partition("=")
-    if not equals:
-        raise ConfigError(f"--where wants ATTRIBUTE=VALUE, got {item!r}")
-    return key, value
+def _conditions(where: Sequence[str]) -> dict[str, str]:
+    """Return attribute -> wanted value."""
+    wanted: dict[str, str] = {}
+    for item in where:
+        key, equals, value = item.partition("=")
+        if not equals:
+            raise ConfigError(f"--where wants ATTRIBUTE=VALUE, got {item!r}")
+        if wanted.setdefault(key, value) != value:  # all must hold, and an image has one of them
+            raise ConfigError(f"--where wants one value of an attribute, got {key}={wanted[key]} and {item}")
+    return wanted
+
+
+def _is_known(attribute: str, datasets: Iterable[DrivingDataset]) -> bool:
+    """Return whether an image has the attribute; looks up to the first."""
+    return any(attribute in dataset.attributes(index) for dataset in datasets for index in range(len(dataset)))
 
 
 def _what_is_unknown(wanted: Mapping[str, str], known: Mapping[str, Collection[str]]) -> str:

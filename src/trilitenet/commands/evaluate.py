@@ -109,14 +109,17 @@ def evaluate(
         The report.
 
     Raises:
-        ConfigError: If a count, a severity or a size is out of range, or an artefact has decided already what a
-            protocol decides.
+        ConfigError: If a count, a severity or a size is out of range, severities are given without corruptions, or an
+            artefact has decided already what a protocol decides.
         OutputError: If there is a report already.
     """
     model, data, output, save = os.fspath(model), Path(data), optional_path(output), optional_path(save)
     check_counts(resamples, worst, limit, paper_batch, batch_size)
     if not severities or not set(severities) <= set(SEVERITIES):
         raise ConfigError(f"--severities must be of 1 to 5, got {', '.join(map(str, severities)) or 'none'}")
+    severities = tuple(dict.fromkeys(severities))  # a mean takes each once
+    if severities != SEVERITIES and not corruptions:
+        raise ConfigError("--severities is for --corruptions; give both")
     check_output(output, overwrite)
     if protocol == "paper":
         _warn_of_thresholds({"confidence": confidence, "iou": iou, "drivable": drivable, "lane": lane})

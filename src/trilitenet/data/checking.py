@@ -30,12 +30,14 @@ from trilitenet.data.reading import (
     IMAGE_ENDINGS,
     IMAGE_FOLDER,
     LABEL_FILES,
+    UNDEFINED,
     check_root,
     decode_grey,
     decode_mask,
     is_crowd,
     is_image_file,
     label_file,
+    parse_attributes,
     read_index,
     split_folders,
 )
@@ -66,8 +68,8 @@ KINDS: Final[dict[str, str]] = {
     "duplicate": "the same file twice in one split",
     "leak-duplicate": "the same file in two splits",
     "leak-near-duplicate": "nearly the same picture in two splits",
-    "leak-sequence": "a sequence (index.csv) with images in two splits",
-    "index": "index.csv and the images disagree",
+    "leak-sequence": "a sequence (index.csv, annotations) with images in two splits",
+    "index": "index.csv and the images disagree, or it lists an image twice",
     "ego-mask": "a mask of the own car that dataset.yaml names and that cannot be read",
     "split-missing": "a split that dataset.yaml names, or a folder of one, and that has no images",
     "anchors": "too many boxes that no anchor fits",
@@ -290,7 +292,9 @@ def check_dataset(
     _find_names(facts, collector)
     _find_duplicates(facts, collector)
     _find_near_duplicates(facts, collector)
-    _find_sequences(index, facts, collector)
+    described = _described(index, facts)
+    _find_sequences(described, collector)
+    _find_unlisted(index, facts, collector)
     for name in _ego_masks(description):
         if not _is_mask(root / name):
             collector.add("ego-mask", "", name)
@@ -310,7 +314,7 @@ def check_dataset(
         images={split: len(items) for split, items in facts.items()},
         labelled={split: _sorted(Counter(t for f in items for t in f.labelled)) for split, items in facts.items()},
         objects={split: _sorted(sum((Counter(f.objects) for f in items), Counter())) for split, items in facts.items()},
-        conditions=_conditions(facts, index),
+        conditions=_conditions(described),
         sizes=_sorted(Counter(f"{f.size[1]}x{f.size[0]}" for items in facts.values() for f in items if f.size)),
         drivable=_means(facts, "drivable"),
         lane=_means(facts, "lane"),
@@ -429,7 +433,7 @@ def _look_at_boxes(
     try:
         content = parse_json((job.root / where).read_bytes())
         items = [item for frame in content["frames"] for item in (frame.get("objects") or ())]
-        attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
+        attributes = parse_attributes(content)
         labels = [(str(item["category"]), item.get("box2d"), is_crowd(item)) for item in items]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         faults.append(("annotation-unreadable", f"{where} ({_reason(error)})"))
@@ -647,46 +651,56 @@ def _popcount(values: NDArray[np.uint64]) -> NDArray[np.uint8]:
     return np.asarray(bits.sum(axis=1), np.uint8)
 
 
-def _find_sequences(index: list[dict[str, str]], facts: dict[str, list[_Facts]], collector: _Collector) -> None:
-    if not index:
-        return
-    listed: dict[str, set[str]] = defaultdict(set)
-    splits_of: dict[str, set[str]] = defaultdict(set)
-    for row in index:
-        split, name = row.get("split", ""), row.get("name", "")
-        listed[split].add(name)
-        if row.get("sequence"):
-            splits_of[f"{row.get('source', '')}/{row['sequence']}".lstrip("/")].add(split)
-    for sequence, splits in sorted(splits_of.items()):
-        if len(splits) > 1:
-            collector.add("leak-sequence", ", ".join(sorted(splits)), sequence)
-    for split in sorted({*listed, *facts}):
-        there = {fact.name for fact in facts.get(split, ())}
-        for name in sorted(listed[split] - there):
-            collector.add("index", split, f"{name}: listed, no image")
-        for name in sorted(there - listed[split]):
-            collector.add("index", split, f"{name}: not listed")
-
-
-def _conditions(facts: dict[str, list[_Facts]], index: list[dict[str, str]]) -> dict[str, dict[str, dict[str, int]]]:
-    """Return attribute -> value -> split -> images, for attributes with few values."""
-    rows = {(row.get("split", ""), row.get("name", "")): row for row in index}
-    described = [
+def _described(index: list[dict[str, str]], facts: dict[str, list[_Facts]]) -> list[tuple[str, dict[str, str]]]:
+    """Return the split and the attributes of each image, as reading gives them."""
+    rows = {
+        (row["split"], row["name"]): {key: value for key, value in row.items() if key not in {"name", "split"}}
+        for row in index
+    }
+    return [
         (split, {**fact.attributes, **rows.get((split, fact.name), {})})
         for split, items in facts.items()
         for fact in items
     ]
+
+
+def _find_sequences(described: list[tuple[str, dict[str, str]]], collector: _Collector) -> None:
+    splits_of: dict[str, set[str]] = defaultdict(set)
+    for split, attributes in described:
+        if attributes.get("sequence"):
+            splits_of[f"{attributes.get('source', '')}/{attributes['sequence']}".lstrip("/")].add(split)
+    for sequence, splits in sorted(splits_of.items()):
+        if len(splits) > 1:
+            collector.add("leak-sequence", ", ".join(sorted(splits)), sequence)
+
+
+def _find_unlisted(index: list[dict[str, str]], facts: dict[str, list[_Facts]], collector: _Collector) -> None:
+    listed: dict[str, Counter[str]] = defaultdict(Counter)
+    for row in index:
+        listed[row["split"]][row["name"]] += 1
+    for split in sorted({*listed, *facts} if index else ()):
+        there = {fact.name for fact in facts.get(split, ())}
+        for name in sorted(listed[split].keys() - there):
+            collector.add("index", split, f"{name}: listed, no image")
+        for name in sorted(there - listed[split].keys()):
+            collector.add("index", split, f"{name}: not listed")
+        for name, count in sorted(listed[split].items()):
+            if count > 1:
+                collector.add("index", split, f"{name}: listed {count} times; the last row counts")
+
+
+def _conditions(described: list[tuple[str, dict[str, str]]]) -> dict[str, dict[str, dict[str, int]]]:
+    """Return attribute -> value -> split -> images, for attributes with few values."""
     table: dict[str, dict[str, Counter[str]]] = defaultdict(lambda: defaultdict(Counter))
-    for key in {key for _, attributes in described for key in attributes} - {"name", "split"}:
+    for key in {key for _, attributes in described for key in attributes}:
         for split, attributes in described:
-            table[key][attributes.get(key) or "undefined"][split] += 1  # as the evaluation calls it
-    total = sum(map(len, facts.values()))
-    limit = max(2, min(40, total // 3))
+            table[key][attributes.get(key) or UNDEFINED][split] += 1
+    limit = max(2, min(40, len(described) // 3))
     return {
         key: {value: dict(sorted(counts.items())) for value, counts in sorted(values.items())}
         for key, values in sorted(table.items())
         if 1 <= len(values) <= limit
-        and not all(value.replace(".", "", 1).isdigit() for value in values.keys() - {"undefined"})
+        and not all(value.replace(".", "", 1).isdigit() for value in values.keys() - {UNDEFINED})
     }
 
 

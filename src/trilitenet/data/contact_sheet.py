@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.data.reading import DrivingDataset, decode_grey
+from trilitenet.data.reading import UNDEFINED, DrivingDataset, decode_grey
 from trilitenet.data.sample import Sample
 from trilitenet.processing.drawing import DRIVABLE_COLOUR, draw, line_thickness
 from trilitenet.processing.letterbox import Letterbox
@@ -127,6 +127,7 @@ def thumbnail(
     if len(name) > _LONGEST:  # what tells it from others is as a rule at its end
         name = f"{name[: _LONGEST // 2 - 2]}..{name[-_LONGEST // 2 :]}"
     text = "  ".join(filter(None, [f"{split}/{name}" if split else name, *_remarks(sample)]))
+    text = text.encode(errors="backslashreplace").decode()  # OpenCV crashes on what is not UTF-8 in a file's name
     cv2.putText(label, text, (3, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (0, 0, 0), 1, cv2.LINE_AA)
     return np.concatenate([small, label])
 
@@ -153,15 +154,17 @@ def pick(dataset: DrivingDataset, where: Mapping[str, str], count: int, *, seed:
 
     Args:
         dataset: The split.
-        where: Attribute -> wanted value.
+        where: Attribute -> wanted value; that of an image without it is `UNDEFINED`.
         count: At most so many.
         seed: Of the order.
         start: Leave out the first so many that fit.
     """
     found: list[int] = []
     for index in np.random.default_rng(seed).permutation(len(dataset)).tolist():
-        if where and not where.items() <= dataset.attributes(index).items():
-            continue
+        if where:
+            attributes = dataset.attributes(index)
+            if any((attributes.get(key) or UNDEFINED) != value for key, value in where.items()):
+                continue
         found.append(index)
         if len(found) >= start + count:
             break

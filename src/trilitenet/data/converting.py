@@ -113,6 +113,8 @@ class ConversionOptions:
     def __post_init__(self) -> None:
         if not all(math.isfinite(width) and width > 0 for width in self.lane_width.values()):
             raise ConfigError(f"lane widths must be above 0 and finite, got {self.lane_width}")
+        if not 0 <= self.max_gap < math.inf:
+            raise ConfigError(f"max_gap must be finite and not negative, got {self.max_gap}")
         class_table(tuple(self.classes), self.classes)
 
     def width(self, split: str) -> float:
@@ -530,7 +532,7 @@ def _place_image(source: Path, target: Path, options: ConversionOptions) -> None
         return
     if target.exists():
         there, here = target.stat(), source.stat()
-        if there.st_ino == here.st_ino or (there.st_size, there.st_mtime_ns) == (here.st_size, here.st_mtime_ns):
+        if os.path.samestat(there, here) or (there.st_size, there.st_mtime_ns) == (here.st_size, here.st_mtime_ns):
             return
     part = target.with_name(f".{os.getpid()}.part")  # short, for names may be as long as file systems take them
     part.unlink(missing_ok=True)

@@ -25,7 +25,7 @@ def identify(dataset: SampleSource) -> dict[str, Any]:
         parts.append(
             {
                 "images": len(part),
-                "names": hashlib.sha256("\0".join(part.names).encode()).hexdigest()[:16],
+                "names": hashlib.sha256("\0".join(part.names).encode(errors="surrogateescape")).hexdigest()[:16],
                 "kind": type(part).__name__,
                 "content": [part.fingerprint(int(index)) for index in chosen],
             }

@@ -28,6 +28,7 @@ import re
 import tarfile
 import time
 import urllib.error
+import urllib.parse
 import urllib.request
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from multiprocessing.sharedctypes import Synchronized
@@ -497,8 +498,8 @@ def _fetch(root: str, name: str, path: Path) -> str:
     Raises:
         DataError: If that fails.
     """
-    url = f"{root.rstrip('/')}/{name}"
-    by_http = url.lower().startswith(("http://", "https://"))
+    by_http = root.lower().startswith(("http://", "https://"))
+    url = f"{root.rstrip('/')}/{urllib.parse.quote(name) if by_http else name}"
     pauses = list(_PAUSES) if by_http and name != PREPARED_FILE else []
     while True:
         try:

@@ -38,6 +38,7 @@ __all__ = [
     "IMAGE_FOLDER",
     "LABEL_FILES",
     "PREPARED_FILE",
+    "UNDEFINED",
     "DrivingDataset",
     "MixedDataset",
     "SampleSource",
@@ -50,6 +51,7 @@ __all__ = [
     "is_image_file",
     "label_file",
     "parse_annotation",
+    "parse_attributes",
     "read_index",
     "sampling_weights",
     "split_folders",
@@ -60,6 +62,8 @@ _LOGGER: Final = logging.getLogger(__name__)
 IMAGE_FOLDER: Final = "images"
 PREPARED_FILE: Final = "prepared.json"
 """Of a copy made for training, which is read by `trilitenet.data.prepared`."""
+UNDEFINED: Final = "undefined"
+"""What the check and the evaluation call the value of an attribute that an image does not have."""
 LABEL_FILES: Final[dict[Task, tuple[str, str]]] = {
     "detection": ("det_annotations", ".json"),
     "drivable": ("da_seg_annotations", ".png"),
@@ -222,7 +226,7 @@ def parse_annotation(
                 else:
                     boxes.append((x1, y1, x2, y2))
                     class_id.append(table[category])
-        attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
+        attributes = parse_attributes(content)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise DataError(f"{name}: not an annotation in the per-image form ({brief(error)})") from error
     return (
@@ -231,6 +235,11 @@ def parse_annotation(
         np.array(ignored, np.float32).reshape(-1, 4),
         attributes,
     )
+
+
+def parse_attributes(content: Mapping[str, Any]) -> dict[str, str]:
+    """Return the attributes of an annotation as text; one whose value is null is not stated."""
+    return {str(key): str(value) for key, value in (content.get("attributes") or {}).items() if value is not None}
 
 
 def is_crowd(item: Mapping[str, Any]) -> bool:
@@ -301,10 +310,12 @@ class DrivingDataset:
         """Return the attributes of an image without decoding it."""
         name = self.names[index]
         content = self._annotation(name)
-        own = (content.get("attributes") if isinstance(content, dict) else None) or {}
-        if not isinstance(own, dict):
-            raise DataError(f"{name}: not an annotation in the per-image form (attributes are no object)")
-        return {str(key): str(value) for key, value in own.items()} | self._extra.get(name, {})
+        try:
+            own = parse_attributes(content) if isinstance(content, dict) else {}
+        except AttributeError as error:
+            path = self.label_path("detection", name)
+            raise DataError(f"{path}: not an annotation in the per-image form (attributes are no object)") from error
+        return own | self._extra.get(name, {})
 
     def label_path(self, task: Task, name: str) -> Path:
         """Return where an image's labels of a task are, if it has any."""
@@ -400,7 +411,9 @@ class DrivingDataset:
         if content is not None:
             labelled = "detection" in self._tasks
             table, ignore = (self._table, self.description.ignore) if labelled else ({}, ())
-            boxes, class_id, ignored, attributes = parse_annotation(content, table, ignore, size, name)
+            boxes, class_id, ignored, attributes = parse_annotation(
+                content, table, ignore, size, str(self.label_path("detection", name))
+            )
             if not labelled:
                 boxes = class_id = None
         drivable, drivable_valid = self._mask("drivable", name, size)
@@ -524,7 +537,8 @@ def sampling_weights(
     Args:
         dataset: Any source of samples; the weights of a `MixedDataset` are multiplied in.
         table: Attribute -> value -> factor, for example ``{"timeofday": {"night": 2.0}, "source": {"dull": 0.5}}``.
-            Values not listed count 1, and the factors of several attributes multiply. 0 leaves a sample out.
+            Values not listed count 1, and the factors of several attributes multiply. 0 leaves a sample out. That of
+            a sample without the attribute is `UNDEFINED`, or empty.
         progress: Called with (samples whose attributes are read, samples in all).
 
     Returns:
@@ -540,12 +554,17 @@ def sampling_weights(
                 raise DataError(f"sampling weight of {attribute}={value} must be finite and not negative, got {factor}")
     if table:
         known: dict[str, set[str]] = {}
+        missed: dict[str, set[str]] = {}  # attribute -> what the samples without it are called
         for index in range(len(dataset)):
             attributes = dataset.attributes(index)
             for attribute, value in attributes.items():
                 known.setdefault(attribute, set()).add(value)
             for attribute, factors in table.items():
-                weights[index] *= factors.get(attributes.get(attribute, ""), 1.0)
+                value = attributes.get(attribute, "")
+                if not value:
+                    missed[attribute] = {"", UNDEFINED}
+                    value = UNDEFINED if UNDEFINED in factors else ""
+                weights[index] *= factors.get(value, 1.0)
             if progress:
                 progress(index + 1, len(dataset))
         for attribute, factors in table.items():
@@ -553,7 +572,7 @@ def sampling_weights(
                 hint = did_you_mean(attribute, known)
                 _LOGGER.warning("no image has the attribute %r to sample by%s", attribute, hint)
                 continue
-            for value in sorted(factors.keys() - known[attribute] - {""}):  # which are the images without it
+            for value in sorted(factors.keys() - known[attribute] - missed.get(attribute, {""})):
                 hint = did_you_mean(value, known[attribute])
                 _LOGGER.warning("no image has the %s %r to sample by%s", attribute, value, hint)
     if not weights.any():
@@ -619,12 +638,13 @@ def read_index(root: Path) -> list[dict[str, Any]]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets put a mark before the first column
             reader = csv.DictReader(file, restval="")
-            columns = set(reader.fieldnames or ())
+            columns = list(reader.fieldnames or ())
             rows = list(reader)
     except (UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"{path}: cannot be read as CSV in UTF-8 ({brief(error)})") from error
-    if not {"name", "split"} <= columns:
-        raise DataError(f"{path}: needs the columns 'name' and 'split'")
+    if not {"name", "split"} <= set(columns):
+        held = few(columns or ["none"], most=10)
+        raise DataError(f"{path}: needs the columns 'name' and 'split', separated by commas; its columns: {held}")
     return [{column: row[column] for column in columns} for row in rows]
 
 

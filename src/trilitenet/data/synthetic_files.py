@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
@@ -22,13 +23,15 @@ from trilitenet.data.description import (
     read_description,
     write_description,
 )
-from trilitenet.data.reading import FOLDERS, IMAGE_FOLDER, label_file
+from trilitenet.data.reading import FOLDERS, IMAGE_FOLDER, label_file, split_folders
 from trilitenet.data.sample import Sample
 from trilitenet.data.synthetic import LaneLabels, Scene, SyntheticScenes
 from trilitenet.errors import Claim, ConfigError, OutputError, replacing, writing
 from trilitenet.processing.cores import ProcessPool
 
 __all__ = ["CATEGORIES", "annotation", "write_dataset", "write_sample"]
+
+_LOGGER: Final = logging.getLogger(__name__)
 
 CATEGORIES: Final = ("car", "truck", "bus")
 """Categories of the vehicles that are written."""
@@ -52,7 +55,8 @@ def write_dataset(
     ``images/{split}/NAME.jpg``, ``det_annotations/{split}/NAME.json`` (BDD100K's form an image, of the categories
     `CATEGORIES`; uncertain vehicles have ``attributes.crowd: true``), ``da_seg_annotations/{split}/NAME.png`` and
     ``ll_seg_annotations/{split}/NAME.png`` (255 = drivable or lane line), and ``dataset.yaml``. The same call goes on
-    where one was interrupted; until the split is whole, ``.synthesis-{split}.json`` says of what call it is.
+    where one was interrupted; until the split is whole, ``.synthesis-{split}.json`` says of what call it is. A warning
+    tells where another split has the scenes of this seed, for then both have the same pictures.
 
     Args:
         root: Folder to write into.
@@ -73,7 +77,7 @@ def write_dataset(
     """
     if count < 1 or workers < 1:
         raise ConfigError(f"count and workers must be at least 1, got {count} and {workers}")
-    SyntheticScenes(seed, size, count, labels=labels)  # refuses what is wrong before there is a folder
+    made = SyntheticScenes(seed, size, count, labels=labels)  # refuses what is wrong before there is a folder
     root = Path(root)
     if not is_folder_name(split):
         raise ConfigError(f"split must be the name of one folder, got {split!r}")
@@ -92,6 +96,9 @@ def write_dataset(
             f"{root / DESCRIPTION_FILE} leaves out {', '.join(left_out)}: add each to a class or to `ignore` there, "
             "or choose another folder"
         )
+    for other in split_folders(root):
+        if other.name != split and (other / f"{made.name(0)}.jpg").exists():
+            _LOGGER.warning("%s has the scenes of seed %d, too; another seed gives other scenes", other, seed)
     with contextlib.ExitStack() as stack:
         stack.enter_context(writing(root))
         root.mkdir(parents=True, exist_ok=True)

@@ -29,7 +29,8 @@ def hash_files(paths: Iterable[Path]) -> str:
     digest = hashlib.sha256()
     for path in sorted(paths, key=lambda path: path.name):
         if path.is_file():
-            digest.update(f"{path.name}\0{hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
+            line = f"{path.name}\0{hashlib.sha256(path.read_bytes()).hexdigest()}\n"
+            digest.update(line.encode(errors="surrogateescape"))  # a name need not be text
     return digest.hexdigest()
 
 

@@ -99,7 +99,7 @@ def figures_by_size(
 
 def _change(name: str, severity: int, seed: int) -> Callable[[NDArray[np.uint8], str], NDArray[np.uint8]]:
     def change(image: NDArray[np.uint8], image_name: str) -> NDArray[np.uint8]:
-        draw = zlib.crc32(f"{seed} {name} {severity} {image_name}".encode())
+        draw = zlib.crc32(f"{seed} {name} {severity} {image_name}".encode(errors="surrogateescape"))
         return corrupt(image, name, severity, np.random.default_rng(draw))
 
     return change

@@ -303,7 +303,7 @@ def test_the_first_of_several_files_is_believed(tmp_path: Path) -> None:
     raw_bdd.write_2020(tmp_path, masks="ids 2020")
     write_entries(
         tmp_path / "labels/lane/polygons/lane_train.json",
-        [{"name": "a1.jpg", "attributes": {"weather": "clear", "lanes": "4"}, "labels": []}],
+        [{"name": "a1.jpg", "attributes": {"weather": "clear", "lanes": "4", "sequence": None}, "labels": []}],
     )
     record = read_bdd100k(tmp_path).record("train", "a1")
     assert record.attributes == {**raw_bdd.ATTRIBUTES, "lanes": "4"}

@@ -340,6 +340,13 @@ def test_paths_may_be_of_windows(tmp_path: Path) -> None:
         assert source == r"JPEGImages\one"
 
 
+def test_an_attribute_of_null_is_none(tmp_path: Path) -> None:
+    write(tmp_path / "one.png")
+    (image,) = coco()["images"]
+    write(tmp_path / "labels.json", coco(images=[{**image, "attributes": {"weather": "rainy", "sequence": None}}]))
+    assert read_coco(tmp_path).record("train", "one").attributes == {"weather": "rainy"}
+
+
 def test_hidden_files_are_passed_over(tmp_path: Path) -> None:
     write(tmp_path / "one.png")
     write(tmp_path / "labels.json", coco())

@@ -27,7 +27,7 @@ from typing import Any, Final
 
 from trilitenet.config import TASKS, Task, parse_json
 from trilitenet.data.rasterise import flatten
-from trilitenet.data.reading import IMAGE_ENDINGS, check_root, is_crowd
+from trilitenet.data.reading import IMAGE_ENDINGS, check_root, is_crowd, parse_attributes
 from trilitenet.data.records import AreaLabel, ImageRecord, LaneLabel, MaskFile, ObjectLabel, same_name
 from trilitenet.errors import DataError, brief, few
 from trilitenet.formats.readers.mapping import Labels, visible
@@ -231,7 +231,7 @@ def parse_labels(content: Any, image: Path, source: str, tasks: Collection[Task]
         for item in _items(content):
             if not _parse_item(item, labels):
                 shapeless |= _task_of(str(item["category"]))
-        labels.attributes = {str(key): str(value) for key, value in (content.get("attributes") or {}).items()}
+        labels.attributes = parse_attributes(content)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise DataError(f"{source}: {image.stem}: {brief(error)} is not as BDD100K has it") from error
     read: dict[Task, bool] = {

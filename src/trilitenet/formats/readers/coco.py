@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilitenet.data.reading import check_root
+from trilitenet.data.reading import check_root, parse_attributes
 from trilitenet.data.records import (
     AreaLabel,
     BrokenRecord,
@@ -165,7 +165,7 @@ def _read_file(
                 reason = f"{path}: image {image['file_name']!r}, {error}"
                 records.append(BrokenRecord(place.stem, place, reason=reason))
                 continue
-            own.attributes = {str(key): str(value) for key, value in (image.get("attributes") or {}).items()}
+            own.attributes = parse_attributes(image)
             records.append(own.record(place.stem, place, mapping.labelled_in(own, tasks), size))
     except DataError:
         raise
