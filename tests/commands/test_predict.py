@@ -930,7 +930,7 @@ def test_what_is_asked_of_the_model_reaches_it(folder: Path, tmp_path: Path, mon
 
     monkeypatch.setattr("trilitenet.commands.predict.load", load)
     asked = {"model": "m.onnx", "device": "cpu", "backend": "openvino", "confidence": 0.4, "long_side": 320}
-    asked["ego_mask"] = "bonnet.png"
+    asked |= {"iou": 0.3, "drivable": 0.6, "lane": 0.7, "ego_mask": "bonnet.png"}
     words = [word for name, value in asked.items() for word in (f"--{name.replace('_', '-')}", str(value))]
     output = str(tmp_path / "out")
     assert cli.main(["predict", str(folder / "alpha.png"), *words, "--batch-size", "2", "--output", output]) == 0

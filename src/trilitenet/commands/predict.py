@@ -110,6 +110,9 @@ def predict(
     device: str = "auto",
     backend: str = "auto",
     confidence: float | None = None,
+    iou: float | None = None,
+    drivable: float | None = None,
+    lane: float | None = None,
     format: Sequence[str] = ("json",),
     overlay: bool = True,
     hide: Sequence[str] = (),
@@ -149,6 +152,9 @@ def predict(
         device: auto (the best there is), cpu, cuda, cuda:1, mps.
         backend: auto (what the file is for), or a runtime by name.
         confidence: Keep boxes whose confidence is above this, in [0, 1]; the model's own if left out.
+        iou: A box goes when it overlaps a better one by more, in [0, 1]; the model's own if left out.
+        drivable: A pixel is drivable above this probability, in [0, 1]; the model's own if left out.
+        lane: A pixel is lane marking above this probability, in [0, 1]; the model's own if left out.
         format: Machine-readable results, one or more: json, jsonl, scalabel, openlabel, coco, yolo, cvat, parquet, csv.
         overlay: Write overlays: NAME.jpg for pictures, NAME.mp4 for videos.
         hide: Parts of the overlay to leave out: drivable, lane, boxes, labels; with --road also lines, distances, above
@@ -211,6 +217,9 @@ def predict(
         device=device,
         backend=backend,
         confidence=confidence,
+        iou=iou,
+        drivable=drivable,
+        lane=lane,
         long_side=long_side,
         batch_size=batch_size,
         ego_mask=ego_mask,
