@@ -213,3 +213,14 @@ def test_openvino_is_imported_without_what_reports_its_use(tmp_path: Path) -> No
     environment = {**{name: value for name, value in os.environ.items() if name != "CI"}, "HOME": str(tmp_path)}
     subprocess.run([sys.executable, "-c", program], env=environment, check=True)
     assert not list(tmp_path.iterdir())  # where the reports keep who they are of
+
+
+@pytest.mark.parametrize("place", ["s3://bucket/results", Path("s3://bucket/results"), Path("https://host/a/b.json")])
+def test_nothing_is_written_to_an_address(place: str | Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(OutputError, match="is an address; results are written into folders"), writing(place):
+        Path(place).mkdir(parents=True)
+    assert not list(tmp_path.iterdir())
+    Path(Path(place).parts[0]).mkdir()  # a folder that is really called so
+    with writing(place):
+        Path(place).mkdir(parents=True)

@@ -22,6 +22,7 @@ import contextlib
 import difflib
 import importlib
 import os
+import re
 import secrets
 import stat
 import sys
@@ -73,6 +74,8 @@ LONGEST_NAME: Final = 255
 """Bytes of a file name that every file system takes."""
 _BEGINNING: Final = 40
 """Characters of a long file name, of up to four bytes each, that its temporary name keeps."""
+_ADDRESS: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:[/\\]")
+"""How an address (``s3://...``) begins, also as a path of it; not ``C:/``, which has one letter."""
 _MOST_SHOWN: Final = 200
 """Characters of a value, or of another library's error, that a message shows."""
 _END: Final = 115
@@ -218,8 +221,10 @@ def writing(output: str | Path) -> Iterator[None]:
     """Tell what the system says on writing, such as that the disk is full, in one line.
 
     Raises:
-        OutputError: For any error of the system.
+        OutputError: For any error of the system, and for an address, of which a folder ``s3:`` would be made.
     """
+    if _ADDRESS.match(str(output)) and not Path(Path(output).parts[0]).exists():
+        raise OutputError(f"{output}: is an address; results are written into folders: give one, and copy it there")
     try:
         yield
     except OSError as error:
