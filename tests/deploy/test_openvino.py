@@ -61,6 +61,8 @@ def test_cells_of_columns_are_views(variant: str) -> None:
     pytest.importorskip("onnx")
     if vector_unit() != "amx":
         pytest.skip("layouts of processors with matrix tiles")
+    if openvino.__version__ < "2026":
+        pytest.skip("older ones copy one map")
     network = lively_network(variant)
     graph = DeployGraph(network, pick_layout("auto", variant, "openvino", unit="amx"))
     info = ArtefactInfo("openvino", "bf16", (384, 640))

@@ -27,7 +27,12 @@ __all__ = ["Builder", "build_by", "name_of", "telling"]
 
 Builder: TypeAlias = "str | Callable[..., TriLiteNet]"
 """A function that builds a network, or its name: ``"FILE.py:FUNCTION"`` or ``"MODULE:FUNCTION"``."""
-_OTHERS: Final = (str(Path(__file__).parents[1]), str(Path(torch.__file__).parent), "<frozen importlib")
+_OTHERS: Final = (
+    str(Path(__file__).parents[1]),
+    str(Path(torch.__file__).parent),
+    str(Path(torch.__file__).parents[1] / "nncf"),  # which wraps PyTorch's functions once it is imported
+    "<frozen importlib",
+)
 """Where code lies that is not the user's: what its path begins with."""
 
 

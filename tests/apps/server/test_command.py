@@ -135,6 +135,23 @@ def test_batches_are_as_large_as_there_are_streams(started: list[Any], backend: 
     assert [_settings(server).max_batch for server in started] == [8, 3, 5]
 
 
+def test_what_is_asked_of_the_model_reaches_it(
+    started: list[Any], backend: FakeBackend, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: dict[str, Any] = {}
+
+    def load(model: str, **options: Any) -> Predictor:
+        given.update(options, model=model)
+        return Predictor(backend)
+
+    monkeypatch.setattr("trilitenet.commands.load.load", load)
+    asked = {"model": "m.onnx", "device": "cpu", "backend": "onnxruntime", "confidence": 0.4, "ego_mask": "bonnet.png"}
+    words = [word for name, value in asked.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+    assert cli.main(["serve", "--port", "0", *words]) == 0
+    assert {**given, "ego_mask": str(given["ego_mask"])} == {**asked, "network": None, "streams": 1}
+    assert len(started) == 1
+
+
 def test_streams_of_a_runtime_without_any_are_refused(started: list[Any]) -> None:
     with pytest.raises(ConfigError, match=r"^tiny runs on .*, and --streams is for OpenVINO alone"):
         command.serve(port=0, streams=2)

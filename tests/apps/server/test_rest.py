@@ -24,6 +24,7 @@ from trilitenet.apps.server.openapi import BatchPrediction, Prediction, Protocol
 from trilitenet.config import ArtefactInfo
 from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.drawing import DRIVABLE_COLOUR, LANE_COLOUR
+from trilitenet.processing.ego_mask import EgoMask
 from trilitenet.structures import Perception, RawOutputs
 
 
@@ -80,6 +81,25 @@ def test_a_confidence_that_the_artefact_cannot_give_is_refused(backend: FakeBack
         answer = client.post("/v1/predict?confidence=0.01", content=jpeg)
     assert answer.status_code == 422
     assert answer.json()["error"]["code"] == "confidence_too_low"
+
+
+def test_nothing_is_found_on_an_ego_mask_and_other_shapes_are_refused(backend: FakeBackend, jpeg: bytes) -> None:
+    own = np.zeros((48, 64), np.bool_)
+    own[30:] = True
+    with TestClient(create_app(Predictor(backend, ego_mask=EgoMask(own)), "tiny")) as client:
+        for query in ("", "?confidence=0.05"):
+            answer = client.post(f"/v1/predict{query}", content=jpeg).json()["perception"]
+            drivable = Perception.from_dict(answer).drivable
+            assert drivable is not None
+            assert drivable[:30].any()
+            assert not drivable[30:].any()
+        upright = encode(picture(48, 64))
+        answer = client.post("/v1/predict", content=upright)
+        assert (answer.status_code, answer.json()["error"]["code"]) == (422, "wrong_shape")
+        assert "the ego mask is of 64x48 pixels, the picture of 48x64" in answer.json()["error"]["message"]
+        files = [("images", ("a.jpg", jpeg)), ("images", ("b.jpg", upright))]
+        results = client.post("/v1/predict/batch", files=files).json()["results"]
+        assert [each["status"] for each in results] == [200, 422]
 
 
 def test_overlay_is_the_picture_with_everything_drawn(client: TestClient, app: Application) -> None:

@@ -26,6 +26,7 @@ def serve(
     device: str = "auto",
     backend: str = "auto",
     confidence: float | None = None,
+    ego_mask: StrPath | None = None,
     streams: int = 1,
     token_file: StrPath | None = None,
     queue: int = 64,
@@ -53,6 +54,7 @@ def serve(
         device: Where the network runs, as for predict.
         backend: The runtime, as for predict.
         confidence: Boxes above this are kept; the model's own threshold if left out.
+        ego_mask: Picture of the own car in view, white on black, as for predict; images of another shape get 422.
         streams: Images that OpenVINO computes at once: more frames a second, more latency.
         token_file: File with the bearer token that clients must bring (or set TRILITENET_TOKEN).
         queue: At most so many images are accepted and not yet answered; one more gets 503.
@@ -71,6 +73,7 @@ def serve(
     Raises:
         ConfigError: If a limit is out of range, the token too short, the port taken, or several streams are asked of a
             runtime that has none.
+        InputError: If the ego mask cannot be read, or marks nothing, or everything.
         MissingExtraError: If the extra "serve" is not installed.
     """
     for module in ("fastapi", "uvicorn", "httptools", "prometheus_client"):
@@ -110,7 +113,13 @@ def serve(
     with (
         listener,
         load(
-            model, network=network, device=device, backend=backend, confidence=confidence, streams=streams
+            model,
+            network=network,
+            device=device,
+            backend=backend,
+            confidence=confidence,
+            streams=streams,
+            ego_mask=ego_mask,
         ) as predictor,
     ):
         if streams > 1 and streams_of(predictor.backend) is None:

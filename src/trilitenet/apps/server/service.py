@@ -27,6 +27,7 @@ from trilitenet.apps.server.intake import Header, MemoryBudget, decode
 from trilitenet.apps.server.metrics import Metrics
 from trilitenet.apps.server.problems import BusyError, ProblemError
 from trilitenet.apps.server.settings import Settings
+from trilitenet.errors import ShapeError
 from trilitenet.inference.predictor import Predictor
 from trilitenet.processing.letterbox import Letterbox
 from trilitenet.structures import Perception, RawOutputs
@@ -117,7 +118,8 @@ class Service:
     async def start(self) -> None:
         """Start the threads and take one grey image the whole way, so that the first request is not slow."""
         self._batcher.start()
-        height, width = self.card.input_size
+        mask = self.predictor.ego_mask
+        height, width = self.card.input_size if mask is None else mask.size
         file = io.BytesIO()
         Image.new("RGB", (width, height), (114, 114, 114)).save(file, "JPEG")
         image = Encoded(file.getvalue(), Header("JPEG", width, height, 1))
@@ -187,7 +189,7 @@ class Service:
 
         Raises:
             BusyError: If it is not through by the deadline.
-            ProblemError: If the image is broken.
+            ProblemError: If the image is broken, or of another shape than the ego mask.
         """
         predictor = self.predictor
         if confidence is not None and confidence < predictor.least_confidence:
@@ -240,7 +242,10 @@ class Service:
         else:
             pixels = image
         start = time.monotonic()
-        canvas, letterbox = self.predictor.preprocess(pixels)
+        try:
+            canvas, letterbox = self.predictor.preprocess(pixels)
+        except ShapeError as error:  # of an ego mask
+            raise ProblemError(422, "wrong_shape", str(error)) from error
         self._note(milliseconds, "preprocess", time.monotonic() - start)
         return pixels if keep_image else None, canvas, letterbox, milliseconds
 
