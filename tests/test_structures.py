@@ -101,6 +101,22 @@ def test_a_size_is_two_whole_numbers(size: Any) -> None:
         Perception(size)
 
 
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("source", 3),
+        ("frame", 1.5),
+        ("frame", "1"),
+        ("timestamp", "1"),
+        ("timestamp", float("nan")),
+        ("timestamp", np.float32("inf")),
+    ],
+)
+def test_where_an_image_is_from_is_checked_when_it_is_told(field: str, value: Any) -> None:
+    with pytest.raises(ShapeError, match=f"{field} must be a"):
+        Perception((2, 2), **{field: value})
+
+
 def test_a_text_is_no_list_of_names() -> None:
     with pytest.raises(ShapeError, match=r"write \('vehicle',\)"):
         Perception((2, 2), class_names="vehicle")  # type: ignore[arg-type]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
+import math
+from numbers import Integral, Real
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -145,6 +147,10 @@ class Perception:
         source: Where the image came from (a path, or a video's name); None if unknown.
         frame: Index of the frame in a video; None for a still image.
         timestamp: Seconds from the start of the video; None for a still image.
+
+    Raises:
+        ShapeError: If something is of another form, or does not fit the rest. Numbers of NumPy and paths are taken, and
+            become Python's own and texts.
     """
 
     size: tuple[int, int]
@@ -164,6 +170,8 @@ class Perception:
             raise ShapeError(f"size must be (height, width) in pixels, got {size!r}")
         if isinstance(names, str):
             raise ShapeError(f"class_names must be several names, got the text {names!r}; write ({names!r},)")
+        self._set(size=(int(size[0]), int(size[1])), class_names=tuple(names))
+        self._check_origin()
         for name in ("drivable", "lane"):
             mask = getattr(self, name)
             if mask is not None and not (
@@ -179,6 +187,26 @@ class Perception:
             for class_id in (int(boxes.class_id.min()), int(boxes.class_id.max())):
                 if not 0 <= class_id < len(self.class_names):
                     raise ShapeError(f"class id {class_id} has no name among {self.class_names}")
+
+    def _set(self, **values: Any) -> None:
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def _check_origin(self) -> None:
+        """Bring what tells where the image is from into Python's own types, which every format can say."""
+        source, frame, timestamp = self.source, self.frame, self.timestamp
+        if isinstance(source, PurePath):
+            self._set(source=str(source))
+        elif source is not None and not isinstance(source, str):
+            raise ShapeError(f"source must be a text or a path, got {source!r}")
+        if frame is not None:
+            if not isinstance(frame, Integral):
+                raise ShapeError(f"frame must be a whole number, got {frame!r}")
+            self._set(frame=int(frame))
+        if timestamp is not None:
+            if not isinstance(timestamp, Real) or not math.isfinite(timestamp):
+                raise ShapeError(f"timestamp must be a finite number of seconds, got {timestamp!r}")
+            self._set(timestamp=float(timestamp))
 
     def __repr__(self) -> str:
         height, width = self.size

@@ -352,6 +352,37 @@ def test_an_interrupted_run_goes_on_where_it_was(
     assert (report.images, report.skipped) == (1, 1)
 
 
+def test_what_an_interruption_left_of_a_video_is_done_anew_though_other_results_were_finished_since(
+    tmp_path: Path, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, output = drive(tmp_path / "a.mp4", frames=8), tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(VideoWriter, "write", write_until(4, lambda: signal.default_int_handler(signal.SIGINT, None)))
+        assert predict_with(predictor, [source], output).interrupted
+    options: dict[str, Any] = {"overlay": False, "skip_existing": True}
+    assert predict_with(predictor, [source], output, format=("openlabel",), **options).frames == 8
+    assert predict_with(predictor, [source], output, format=("openlabel",), **options).skipped == 1
+    assert predict_with(predictor, [source], output, **options).frames == 8
+    assert (output / "a.unfinished.part").is_file()  # of the overlay
+    assert predict_with(predictor, [source], output, skip_existing=True).frames == 8
+    assert len(list(VideoReader(output / "a.mp4"))) == 8
+    assert list(output.glob("*.part")) == []
+    (output / "a.unfinished.part").touch()  # one that names nothing is of any file
+    assert predict_with(predictor, [source], output, skip_existing=True).frames == 8
+    assert list(output.glob("*.part")) == []
+
+
+def test_results_in_other_forms_may_lie_in_the_folder(folder: Path, tmp_path: Path, predictor: Predictor) -> None:
+    sources, output = [folder / "photo.jpg", drive(tmp_path / "drive.mp4", frames=2)], tmp_path / "out"
+    predict_with(predictor, sources, output, overlay=False)
+    before = {path: path.read_bytes() for path in output.iterdir()}
+    predict_with(predictor, sources, output, format=("openlabel", "coco"))
+    assert {path: path.read_bytes() for path in before} == before
+    for there in ("photo.jpg", "drive.mp4"):
+        with pytest.raises(OutputError, match=f"{there}: exists already"):
+            predict_with(predictor, [sources[there == "drive.mp4"]], output, format=("csv",))
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 20])
 def test_shards_do_each_source_once_and_call_it_as_one_process_would(
     folder: Path, tmp_path: Path, predictor: Predictor, count: int

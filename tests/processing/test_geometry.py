@@ -113,6 +113,7 @@ def test_resizing_keeps_the_view() -> None:
     ("change", "message"),
     [
         ({"height": 0.0}, "height must be positive"),
+        ({"height": 140}, "height must be at most 10.0 metres above the road, got 140"),  # centimetres
         ({"fx": -1.0}, "fx must be positive"),
         ({"pitch": 2.0}, "between -90 and 90 degrees"),
         ({"distortion": (0.1,)}, "coefficients, got 1"),

@@ -181,6 +181,18 @@ def test_late_frames_leave_the_closing_speed_alone() -> None:
     assert leads.update(lead, boxes, 60 / 25, camera).closing_speed is not None  # type: ignore[union-attr]
 
 
+def test_the_same_moment_again_makes_no_closing_speed_surer() -> None:
+    camera, found = Camera.from_field_of_view((384, 640), 60.0, 1.4), []
+    boxes = Boxes(np.array([[300, 180, 340, 220]], np.float32), np.ones(1, np.float32), np.zeros(1, np.int64))
+    for times in (1, 3):
+        leads = LeadFilter()
+        for index in range(25 * times):
+            moment = index // times / 25
+            told = leads.update(LeadVehicle(0, 7, Estimate(30.0 - 8 * moment, 1.0)), boxes, moment, camera)
+        found.append(told)
+    assert found[1] == found[0]
+
+
 @pytest.mark.parametrize("rate", [5, 25, 60])
 @pytest.mark.parametrize("braking", [2.0, 4.0])
 def test_the_error_of_a_closing_speed_holds_while_the_lead_brakes(rate: int, braking: float) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 from pathlib import Path
 
-from trilitenet.commands.predict_plan import Plan, mark_of
+from trilitenet.commands.predict_plan import Plan, mark_of, read_mark
 from trilitenet.errors import writing
 from trilitenet.inference.sources import FrameReader
 
@@ -20,6 +22,7 @@ class Marks:
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
+        self._videos = {source.name: source for source in plan.sources if isinstance(source, FrameReader)}
         self._unfinished: dict[str, bool] = {}
         self._gathered = False
         self.whole = False
@@ -54,15 +57,34 @@ class Marks:
         self._unfinished[name] = False
 
     def mark_unfinished(self, name: str) -> None:
-        """Leave the mark of a video that was not done to its end."""
+        """Leave the mark of a video that was not done to its end, which names its results."""
         if self._unfinished.get(name):
-            self._plan.mark(name).touch()
+            mark = self._plan.mark(name)
+            _write_mark(mark, self._files(name) | (read_mark(mark) or frozenset()))
 
     def remove_unfinished(self) -> None:
-        """Remove the marks of videos that were done to their end, and of those that have no results."""
-        for source in self._plan.sources:
-            if isinstance(source, FrameReader) and source.name in self._unfinished:
-                mark = self._plan.mark(source.name)
-                if not (self._unfinished[source.name] and any(map(Path.exists, self._plan.files(source, source.name)))):
-                    with writing(mark):
-                        mark.unlink(missing_ok=True)
+        """Remove the marks of videos that were done to their end, and of those that have no results.
+
+        Those of files that an earlier run left, and this one did not replace, stay.
+        """
+        for name, unfinished in self._unfinished.items():
+            mark = self._plan.mark(name)
+            rest = read_mark(mark) or frozenset()
+            if not unfinished:
+                rest -= self._files(name)
+            with writing(mark):
+                if any(map(Path.exists, rest)):
+                    _write_mark(mark, rest)
+                else:
+                    mark.unlink(missing_ok=True)
+
+    def _files(self, name: str) -> frozenset[Path]:
+        return frozenset(self._plan.files(self._videos[name], name))
+
+
+def _write_mark(mark: Path, files: frozenset[Path]) -> None:
+    mark.touch()
+    with contextlib.suppress(OSError):  # no room for the names: it is of any file then
+        mark.write_text(
+            json.dumps(sorted(file.relative_to(mark.parent).as_posix() for file in files)), encoding="utf-8"
+        )

@@ -19,7 +19,7 @@ from trilitenet.inference.sources import Clip, Failure, FrameReader, SequenceRea
 from trilitenet.processing.drawing import PARTS, check_parts
 from trilitenet.road.drawing import ROAD_PARTS
 
-__all__ = ["RATE", "Plan", "mark_of", "read_list"]
+__all__ = ["RATE", "Plan", "mark_of", "read_list", "read_mark"]
 
 _LOGGER: Final = logging.getLogger(__name__)
 
@@ -91,7 +91,7 @@ class Plan:
             self._keep_shard(*part)
         self.skipped = self._leave_out_done() if skip_existing else 0
         self._check_output()
-        self._check_formats()
+        self._check_files()
         self.gathered = [self.output / file for file, holds in self._shared() if holds]
 
     def _tell_idle_options(self, rate: float) -> None:
@@ -147,7 +147,7 @@ class Plan:
             name
             for source in self.sources
             for name in _names(source)
-            if self.mark(name).exists() or not all(path.exists() for path in self.files(source, name))
+            if self._is_unfinished(source, name) or not all(path.exists() for path in self.files(source, name))
         }
         before = len(self._left())
         self._keep(left)
@@ -171,8 +171,13 @@ class Plan:
         """Return the files that are a source's alone."""
         patterns = [pattern for each in self.formats for pattern in _patterns(find_writer(each), source)]
         if self.overlay:
-            patterns.append("{}.jpg" if isinstance(source, Stills) else "{}.mp4")
+            patterns.append(_overlay(source))
         return [self.output / pattern.format(self.stems[name]) for pattern in patterns]
+
+    def _is_unfinished(self, source: Stills | FrameReader, name: str) -> bool:
+        """Return whether a mark says that files of a source, of those that this run would write, lack some frames."""
+        marked = read_mark(self.mark(name))
+        return marked is not None and (not marked or not marked.isdisjoint(self.files(source, name)))
 
     def mark(self, name: str) -> Path:
         """Return the file that is there while the results of a video are not of all its frames."""
@@ -198,10 +203,8 @@ class Plan:
         for path in alike:
             if path.resolve() in originals:
                 raise OutputError(f"{path}: results would lie beside their source; choose another --output")
-            if not self.overwrite:
-                raise OutputError(f"{path}: exists already; choose another --output or add --overwrite")
 
-    def _check_formats(self) -> None:
+    def _check_files(self) -> None:
         """Refuse formats that do not exist, and files that exist or would be written twice."""
         planned: dict[str, str] = {}
         for file, what in sorted(self._plan(), key=lambda one: "*" not in one[0]):
@@ -213,7 +216,12 @@ class Plan:
             planned[file] = what
         if self.overwrite:
             return
-        found = [self.output / file for file in planned if (self.output / file).exists()]
+        overlays = [
+            _overlay(source).format(self.stems[name])
+            for source in (self.sources if self.overlay else ())
+            for name in _names(source)
+        ]
+        found = [self.output / file for file in (*overlays, *planned) if (self.output / file).exists()]
         for folder in {(self.output / file).parent for file in planned if "*" in file}:
             for path in folder.iterdir() if folder.is_dir() else ():
                 if _numbered(path.relative_to(self.output).as_posix()) in planned:
@@ -301,12 +309,26 @@ def mark_of(file: Path) -> Path:
     return part_of(file.with_name(f"{file.name}.unfinished"))
 
 
+def read_mark(mark: Path) -> frozenset[Path] | None:
+    """Return the files that a mark names; none if it names none, and may be of any; None if it is not there."""
+    if not mark.exists():
+        return None
+    try:
+        return frozenset(mark.parent / name for name in json.loads(mark.read_text(encoding="utf-8")))
+    except (OSError, TypeError, ValueError):
+        return frozenset()
+
+
 def _names(source: Stills | FrameReader) -> list[str]:
     return [str(path) for path in source.paths] if isinstance(source, Stills) else [source.name]
 
 
 def _patterns(writer: type[Writer], source: Stills | FrameReader) -> tuple[str, ...]:
     return writer.PICTURE_FILES if isinstance(source, Stills) else writer.VIDEO_FILES
+
+
+def _overlay(source: Stills | FrameReader) -> str:
+    return "{}.jpg" if isinstance(source, Stills) else "{}.mp4"
 
 
 def _numbered(file: str) -> str:

@@ -28,6 +28,8 @@ Floats = NDArray[np.float64]
 
 _EXACT: Final = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)
 """When the inverse of a lens is found: OpenCV's usual five steps leave wide lenses pixels off."""
+_HIGHEST: Final = 10.0
+"""Metres above the road that a camera in a vehicle can be: more is meant in other units."""
 _OF_VEHICLE: Final = {"front": (0.0, 10.0), "left": (-2.0, 2.0), "vehicle_width": (0.5, 4.0)}
 """Metres between which a camera's place in a vehicle, and the vehicle's width, can be."""
 _MAX_MISS: Final = 0.5
@@ -54,8 +56,9 @@ class Camera:
         vehicle_width: Metres; None where it is not known.
 
     Raises:
-        ConfigError: If a number is not finite, a length not positive, an angle not between -pi/2 and pi/2, the
-            number of distortion coefficients not one of OpenCV's, or the vehicle not one of a road's.
+        ConfigError: If a number is not finite, a length not positive, the height above 10 metres, an angle not between
+            -pi/2 and pi/2, the number of distortion coefficients not one of OpenCV's, or the vehicle not one of a
+            road's.
     """
 
     size: tuple[int, int]
@@ -77,6 +80,8 @@ class Camera:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ConfigError(f"camera {name} must be positive, got {value}")
+        if self.height > _HIGHEST:
+            raise ConfigError(f"camera height must be at most {_HIGHEST} metres above the road, got {self.height}")
         if not all(map(math.isfinite, (self.cx, self.cy, *self.distortion))):
             raise ConfigError("camera cx, cy and distortion must be finite numbers")
         for name in ("pitch", "yaw", "roll"):

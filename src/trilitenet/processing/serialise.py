@@ -67,20 +67,14 @@ def perception_to_dict(perception: Perception) -> dict[str, Any]:
     """Return what ``json.dumps`` takes. Coordinates are pixels of the source image, rounded to 1/100.
 
     A task the model lacks is null; a task that found nothing is an empty list or an empty mask.
-
-    Raises:
-        ShapeError: If the timestamp is not finite, which JSON cannot say.
     """
     height, width = perception.size
-    moment = perception.timestamp
-    if moment is not None and not math.isfinite(moment):
-        raise ShapeError(f"timestamp {moment} is not finite, which JSON cannot say")
     return {
         "schema": SCHEMA_VERSION,
-        "source": None if perception.source is None else str(perception.source),
-        "frame": None if perception.frame is None else int(perception.frame),
-        "timestamp": None if moment is None else round(float(moment), 6),
-        "size": {"height": int(height), "width": int(width)},
+        "source": perception.source,
+        "frame": perception.frame,
+        "timestamp": None if perception.timestamp is None else round(perception.timestamp, 6),
+        "size": {"height": height, "width": width},
         "class_names": list(perception.class_names),
         "boxes": None if perception.boxes is None else _boxes_to_list(perception.boxes, perception.class_names),
         "drivable": None if perception.drivable is None else encode_mask(perception.drivable),

@@ -499,7 +499,7 @@ class LeadFilter:
         noise = math.hypot(pixel * (seen**2 + camera.height**2) / (camera.fy * camera.height), shaken)
         step = timestamp - self._last
         same = self._state is not None and -LATE <= step <= self.GAP + 1e-6 and self._is_same(lead, box)
-        late = self._state is not None and -LATE <= step < 0
+        late = self._state is not None and -LATE <= step <= 0  # or the same moment again
         if late and not same:
             return lead
         if same and not late:

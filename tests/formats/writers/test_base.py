@@ -20,6 +20,7 @@ import pytest
 from tests.fakes import written_by_another_process
 from trilitenet.errors import ConfigError, OutputError, part_of
 from trilitenet.formats.writers.base import WRITERS, JsonStream, open_writer, uninterrupted
+from trilitenet.road.structures import Road
 from trilitenet.structures import Boxes, Perception
 
 TASKS_GONE = Perception(size=(120, 200), class_names=("vehicle",), source="tasks.jpg")
@@ -230,12 +231,51 @@ def test_a_failed_write_leaves_no_file_with_a_gap(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_name_that_is_not_utf_8_is_refused_and_spoils_no_other(
+    format_name: str, tmp_path: Path, pictures: list[Perception], video: list[Perception]
+) -> None:
+    for folder, bad in (("one", ()), ("two", (pictures[0], video[0]))):
+        with open_writer(format_name, tmp_path / folder) as writer:
+            for perception in bad:
+                with pytest.raises(OutputError, match=r"caf\\udce9: its name is not UTF-8; rename it"):
+                    writer.write(dataclasses.replace(perception, source="caf\udce9"))
+            for perception in [*pictures, *video]:
+                writer.write(perception)
+    files = {
+        folder: {path.name: path.read_bytes() for path in (tmp_path / folder).rglob("*") if path.is_file()}
+        for folder in ("one", "two")
+    }
+    assert files["two"] == files["one"]
+
+
+def test_paths_and_numbers_of_numpy_are_written_as_others_are(
+    format_name: str, tmp_path: Path, pictures: list[Perception], video: list[Perception]
+) -> None:
+    kinds: dict[str, tuple[Any, Any, Any]] = {"one": (str, int, float), "two": (Path, np.int64, np.float32)}
+    for folder, (text, whole, number) in kinds.items():
+        with open_writer(format_name, tmp_path / folder) as writer:
+            for perception in (pictures[0], video[0], video[1]):
+                origin: dict[str, Any] = {"source": text(perception.source), "size": tuple(map(whole, perception.size))}
+                if perception.frame is not None:
+                    origin |= {"frame": whole(perception.frame), "timestamp": number(perception.frame / 4)}
+                writer.write(dataclasses.replace(perception, **origin))
+    files = {
+        folder: {path.name: path.read_bytes() for path in (tmp_path / folder).rglob("*") if path.is_file()}
+        for folder in ("one", "two")
+    }
+    assert files["two"] == files["one"]
+
+
 @pytest.mark.parametrize("name", ["json", "openlabel"])
-def test_a_value_that_json_has_not_leaves_no_broken_file(name: str, tmp_path: Path, video: list[Perception]) -> None:
+def test_a_value_that_json_has_not_leaves_no_broken_file(
+    name: str, tmp_path: Path, video: list[Perception], road: Road
+) -> None:
+    document = road.to_dict()
+    document["ego_lane"]["offset"]["value"] = float("nan")
     with open_writer(name, tmp_path) as writer:
         writer.write(video[0])
         with pytest.raises(ValueError, match="JSON"):
-            writer.write(dataclasses.replace(video[1], timestamp=float("nan")))
+            writer.write(video[1], document)
     (path,) = tmp_path.glob("*.json")
     assert json.loads(path.read_text())
 

@@ -109,13 +109,15 @@ class Writer(abc.ABC):
                 leaves it out.
 
         Raises:
-            OutputError: If a file exists and may not be replaced, or cannot be written, or an earlier one could not; or
-                if the writer was closed.
+            OutputError: If a file exists and may not be replaced, or cannot be written, or an earlier one could not; if
+                the source's name is not UTF-8, as files of text need it; or if the writer was closed.
         """
         if self._closed:
             raise OutputError(f"{self.output}: the writer was closed")
         if self._broken:
             raise OutputError(f"{self.output}: a result could not be written, and what followed it would have a gap")
+        if perception.source is not None:
+            _check_text(perception.source)  # before anything of it is kept, which the file could not hold at its end
         with uninterrupted():
             self._empty = False
             try:
@@ -244,6 +246,19 @@ def open_writer(format: str, output: str | Path, *, overwrite: bool = False, **o
         MissingExtraError: If the format needs a package that is not installed.
     """
     return find_writer(format)(Path(output), overwrite=overwrite, **options)
+
+
+def _check_text(source: str) -> None:
+    """Refuse a name that is not UTF-8, which Python holds, but no file of text can.
+
+    Raises:
+        OutputError: If it is one.
+    """
+    try:
+        source.encode()
+    except UnicodeEncodeError as error:
+        shown = source.encode(errors="backslashreplace").decode()
+        raise OutputError(f"{shown}: its name is not UTF-8; rename it") from error
 
 
 def file_stem(source: str) -> str:
